@@ -15,13 +15,13 @@ from collections.abc import Callable, Generator, Iterator
 from functools import cache
 from pathlib import Path
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")  # tests run in a process a core
-# Tests make their inputs on the CPU, and ask for equal bytes, which a GPU's atomics do not give.
-# Those about another device choose it themselves.
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # tests run in one process per core
+# Tests make their inputs on the CPU and expect equal bytes, which a GPU's atomics do not give.
+# Tests of another device select it themselves.
 os.environ.setdefault("AEGIS_DEVICE", "cpu")
 os.environ["HF_HUB_OFFLINE"] = "1"  # no test depends on a network
 os.environ.pop("COLUMNS", None)  # nor on the width of somebody's terminal
-# Else each of hundreds of processes would compile the package anew.
+# Otherwise each of hundreds of processes would compile the package again.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 import pytest
@@ -39,8 +39,8 @@ from aegis_cli.models.backbones.embedded import EmbeddedVLM
 from aegis_cli.recipes import ANCHOR_PARTS, Anchor
 
 TESTS = Path(__file__).parent
-# They take the longest, half a minute and more each, and come first: of those that came last, a
-# process would still have one when the others have nothing left to do.
+# These take longest, half a minute or more each, and run first. If they ran last, one process
+# would still be busy when the others have nothing left to do.
 LONG = (
     "training/test_parallel.py",
     "training/test_validation_rollout.py",
@@ -53,7 +53,7 @@ LONG = (
     "studies/test_pipeline.py",
     "sim/test_metaworld.py",
 )
-# How many modules were there when garbage was last collected, and how many more are worth another.
+# The number of modules at the last garbage collection, and how many more call for another one.
 MODULES, MANY_MODULES = pytest.StashKey[int](), 100
 
 _TESTS_BEGUN = itertools.count()
@@ -62,7 +62,7 @@ _CACHE, _MEASURED = (
     ("anchors", "answers", "digests", "episodes", "merges", "predictions"),
 )
 
-# An example may take longer on a machine that does something else, too.
+# An example may take longer on a busy machine.
 settings.register_profile("unhurried", deadline=None)
 settings.load_profile("unhurried")
 
@@ -84,10 +84,10 @@ pytest_plugins = [
 
 
 def pytest_configure() -> None:
-    """Heed Ctrl-C, which a script's background jobs ignore, and so the processes of tests too."""
+    """Handle Ctrl-C, which a script's background jobs ignore, and so would the tests' processes."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    # As for the processes that tests start. Every worker would compile all tests, with what pytest
-    # adds to their assertions: 25 seconds.
+    # As for the processes that tests start. Otherwise every worker would compile all tests, with
+    # the assertions that pytest rewrites: 25 seconds.
     sys.dont_write_bytecode = False
 
 
@@ -101,7 +101,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
-    """`-m fast` does not even import the files that have no fast tests; None: others decide."""
+    """Under `-m fast`, do not even import files without fast tests; None: others decide."""
     if config.option.markexpr != "fast" or collection_path.suffix != ".py":
         return None
     if collection_path.name == "conftest.py":
@@ -112,29 +112,29 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 
 @pytest.hookimpl(wrapper=True)
 def pytest_collection() -> Generator[None, object, object]:
-    """Look for no garbage while the tests are imported."""
+    """Collect no garbage while the tests are imported."""
     with garbage.left_out():
         return (yield)
 
 
 @pytest.hookimpl(trylast=True)
 def pytest_collection_finish(session: pytest.Session) -> None:
-    """What the modules and the tests consist of stays to the end."""
+    """Keep the objects of the modules and tests until the end."""
     keep_what_is_there(session)
 
 
 @pytest.hookimpl(trylast=True)
 def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> None:
-    """So is what a file leaves, and what has just been imported for the first time."""
+    """Also keep what a file leaves, and the modules that it has imported for the first time."""
     of_another_file = nextitem is None or nextitem.path != item.path
     if of_another_file or len(sys.modules) > item.session.stash[MODULES] + MANY_MODULES:
         keep_what_is_there(item.session)
 
 
 def keep_what_is_there(session: pytest.Session) -> None:
-    """Leave the objects that are alive out of each later collection of garbage.
+    """Exclude the objects that are alive now from all later garbage collections.
 
-    They are millions. A dry run, which looks at all that are alive, took seconds.
+    There are millions of them. A dry run, which looks at all live objects, took seconds.
     """
     gc.collect()
     gc.freeze()
@@ -143,7 +143,7 @@ def keep_what_is_there(session: pytest.Session) -> None:
 
 @pytest.fixture(scope="session", autouse=True)
 def nothing_waits_for_the_disk() -> Iterator[None]:
-    """What only a power cut could show no test looks at; a training waits for its disk 16 times."""
+    """Skip fsync, which only a power cut would show; a training waits for its disk 16 times."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(os, "fsync", lambda descriptor: None)
         yield
@@ -151,7 +151,7 @@ def nothing_waits_for_the_disk() -> Iterator[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def what_is_measured_is_kept_apart(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """What fixtures measure is none of the user's, nor of an earlier session."""
+    """Keep what fixtures measure apart from the user's cache and from earlier sessions."""
     folder = tmp_path_factory.mktemp("kept")
     with pytest.MonkeyPatch.context() as patch:
         _keep_in(folder, patch)
@@ -162,12 +162,12 @@ def what_is_measured_is_kept_apart(tmp_path_factory: pytest.TempPathFactory) -> 
 def every_test_measures(
     what_is_measured_is_kept_apart: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What a test measures, maybe of a model that it has changed, no other one finds."""
+    """No other test finds what a test has measured, perhaps of a model that it has changed."""
     _keep_in(what_is_measured_is_kept_apart / str(next(_TESTS_BEGUN)), monkeypatch)
 
 
 def _keep_in(folder: Path, patch: pytest.MonkeyPatch) -> None:
-    """Let measurements and digests lie there; large pictures are shared by all tests."""
+    """Put measurements and digests into the folder; all tests share the large pictures."""
 
     def chosen(name: str) -> Path:
         asked_for = "AEGIS_CACHE" in os.environ

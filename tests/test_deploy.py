@@ -1,4 +1,4 @@
-"""A trained policy in a program of one's own does what the run's policy does."""
+"""A trained policy in a user's program does the same as the run's policy."""
 
 from __future__ import annotations
 
@@ -59,12 +59,12 @@ def test_it_predicts_what_the_runs_policy_predicts(run_folder: Path) -> None:
 
 @pytest.fixture(params=[torch.float64, torch.bfloat16, "meta"], ids=str)
 def another_default(request: pytest.FixtureRequest) -> Iterator[Callable[[], None]]:
-    """A program whose new tensors are of another type, as one that simulates in float64.
+    """A program whose new tensors have another dtype, like one that simulates in float64.
 
-    Or on another device, as one that has set a GPU; numbers on "meta" have no values.
+    Or they are on another device, as if it had set a GPU; numbers on "meta" have no values.
 
     Returns:
-        what sets them.
+        a function that sets the defaults.
     """
     is_type = isinstance(request.param, torch.dtype)
     change = torch.set_default_dtype if is_type else torch.set_default_device
@@ -76,7 +76,7 @@ def another_default(request: pytest.FixtureRequest) -> Iterator[Callable[[], Non
 def test_the_programs_defaults_change_no_action(
     run_folder: Path, tmp_path: Path, another_default: Callable[[], None]
 ) -> None:
-    """Neither loading nor acting asks for them, nor an ensemble, nor a chunk that continues one."""
+    """Loading and acting do not depend on them, nor does an ensemble, nor a continued chunk."""
     export.run(run_folder, tmp_path / "lerobot")
     picture = frame()
     expected = acted(run_folder, picture)
@@ -86,7 +86,7 @@ def test_the_programs_defaults_change_no_action(
 
 
 def acted(folder: Path, picture: np.ndarray) -> np.ndarray:
-    """What the policy of a folder does, in each of the ways that there are to ask it."""
+    """The actions of a folder's policy, in each of the ways to ask for them."""
     own, averaging = load_policy(folder), load_policy(folder, ensemble=0.01)
     positions = [0.1] * own.positions
     found = [one.select_action(picture, TEXT, positions) for one in (own, averaging, own.begin())]
@@ -104,7 +104,7 @@ def test_a_picture_that_nobody_may_write_to_is_taken_as_it_is() -> None:
 
 
 def test_it_knows_the_names_of_its_numbers_and_its_rate(run_folder: Path, tmp_path: Path) -> None:
-    """Those of the demonstrations, also of another episode and after each export and back."""
+    """The demonstrations' names, also after other episodes and after each export and back."""
     spec = sim.make("reach").spec
     expected = (spec.action_names, spec.proprio_names, spec.control_hz)
     export.run(run_folder, tmp_path / "lerobot")
@@ -146,7 +146,7 @@ def test_of_a_stream_it_is_the_policy_of_the_task(task: str, make: Any, tmp_path
 def test_of_a_stream_it_takes_a_picture_of_each_camera(
     cameras: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """A single one needs no name there, either."""
+    """A single camera needs no name there either."""
     acting = Acting(make_policy().eval(), "libero/object", REPLAN, cameras)
     monkeypatch.setattr(deploy, "is_robot_stream_run", lambda _: True)
     run = SimpleNamespace(
@@ -173,7 +173,7 @@ def test_actions_of_a_chunk_come_one_by_one_and_a_new_chunk_is_of_the_new_pictur
 
 
 def test_a_chunk_continues_what_the_robot_executes_meanwhile(run_folder: Path) -> None:
-    """What is held to it is near to it, all the more where it is executed; and nothing else is."""
+    """The held part is close to the old chunk, most where it is executed; the rest is free."""
     own = load_policy(run_folder, seed=3)
     free = own.predict_action_chunk(frame(), TEXT, [0.1] * own.positions)
     own.reset()
@@ -184,7 +184,7 @@ def test_a_chunk_continues_what_the_robot_executes_meanwhile(run_folder: Path) -
     scale = own._policy.action_scale.std.numpy()
     previous = free[2:] + 2 * scale * np.random.default_rng(0).normal(size=free[2:].shape)
     own.reset()
-    with torch.inference_mode():  # nor does a program's own mode stand in the way
+    with torch.inference_mode():  # a program's own inference mode makes no difference
         held = own.predict_action_chunk(
             frame(), TEXT, [0.1] * own.positions, previous=previous, delay=2
         )
@@ -234,7 +234,7 @@ def test_a_delay_that_is_none_has_another_cure_than_one_that_is_too_long(
 
 
 def test_another_instruction_drops_the_chunk_of_the_one_before() -> None:
-    """What is left of a chunk is not played on, nor taken up again."""
+    """The rest of a chunk is neither executed nor continued."""
     own, other = deployed(), deployed()
     first = other.predict_action_chunk(frame(0), TEXT, POSITIONS)
     second = other.predict_action_chunk(frame(1), OTHER, POSITIONS)
@@ -270,7 +270,7 @@ def test_a_picture_of_another_size_is_fitted_as_in_training() -> None:
 
 
 class Cameras:
-    """A policy that shows what it was shown."""
+    """A policy that returns the pictures it was given."""
 
     def __init__(self) -> None:
         inner = make_policy()
@@ -306,7 +306,7 @@ def test_the_picture_of_a_single_camera_may_have_its_name(name: str, given: str 
 
 
 def test_a_backbone_of_any_size_is_shown_the_sizes_of_training() -> None:
-    """Each camera has its own, also in a further episode; unknown ones are shown as they are."""
+    """Each camera has its own, in later episodes too; unknown ones are shown as they are."""
     policy = Cameras()
     policy.backbone.image_size = None
     sizes = ((40, 60), (30, 30))
@@ -342,7 +342,7 @@ def test_a_backbone_of_any_size_is_shown_the_sizes_of_training() -> None:
 def test_what_it_was_not_trained_on_is_one_error(
     cameras: tuple[str, ...], pictures: Any, positions: Any, told: tuple[str, ...]
 ) -> None:
-    """At the call that predicts, and at one that goes on with a chunk."""
+    """At the call that predicts, and at a call that continues a chunk."""
     begun = deployed(cameras=cameras)
     begun._ahead.append(np.zeros(2, dtype=np.float32))
     for policy in (deployed(cameras=cameras), begun):
@@ -372,7 +372,7 @@ def test_unknown_words_runs_and_tasks_are_one_error(run_folder: Path, tmp_path: 
 
 
 def test_actions_that_are_not_finite_are_refused() -> None:
-    """A finite position can be so far off that what is predicted of it is not finite."""
+    """A finite position can be so far off that the prediction for it is not finite."""
     own = deployed()
     for act in (own.predict_action_chunk, own.select_action):
         with pytest.raises(AegisError, match=r"8 of 8 predicted numbers .* not finite"):
@@ -388,14 +388,14 @@ NAMES = {"action_names": ["pan.pos", "lift.pos"], "proprio_names": ["a.pos", "b.
 
 
 def lemotors() -> dict[str, Any]:
-    """As LeRobot's preprocessing gives an observation."""
+    """An observation as LeRobot's preprocessing passes it."""
     shown = torch.from_numpy(frame()).permute(2, 0, 1).float() / 255
     state = torch.tensor([POSITIONS])
     return {"observation.images.top": shown[None], "observation.state": state, "task": [TEXT]}
 
 
 def motors() -> dict[str, Any]:
-    """As a robot gives it."""
+    """An observation as a robot gives it."""
     return {"top": frame(), "c.pos": POSITIONS[2], "a.pos": POSITIONS[0], "b.pos": POSITIONS[1]}
 
 
@@ -445,7 +445,7 @@ def test_an_action_has_the_names_that_a_robot_takes() -> None:
     ],
 )
 def test_an_observation_that_does_not_fit_is_one_error(given: Any, told: str) -> None:
-    """At the call that predicts, and at one that goes on with a chunk."""
+    """At the call that predicts, and at a call that continues a chunk."""
     begun = deployed(cameras=("top",), recorded=NAMES)
     begun.select_action(motors(), TEXT)
     for policy in (deployed(cameras=("top",), recorded=NAMES), begun):
@@ -458,7 +458,7 @@ def test_an_observation_that_does_not_fit_is_one_error(given: Any, told: str) ->
 
 
 def test_an_ensemble_averages_what_was_predicted_for_each_step() -> None:
-    """By a naive sum over ACT's weights; another policy begins anew, and so does an episode."""
+    """Compared with a plain sum of ACT's weights; a new policy or episode starts anew."""
     decay, steps = 0.3, 7
     own, plain = deployed(ensemble=decay), deployed()
     chunks = [plain.predict_action_chunk(frame(i % 3), TEXT, POSITIONS) for i in range(steps)]
@@ -486,7 +486,7 @@ def test_another_instruction_begins_the_ensemble_anew() -> None:
 def test_the_decay_of_a_run_is_its_recipes_or_the_one_asked_for(
     tiny_folder: Path, demos_file: Path, tmp_path: Path
 ) -> None:
-    """Also after each export and back."""
+    """This holds after each export and back."""
     chosen = recipe(tiny_folder, steps=2)
     chosen = replace(chosen, rollout=replace(chosen.rollout, replan=1, ensemble=0.25))
     train.run(chosen, "naive", demos_file, None, tmp_path / "run")
@@ -519,7 +519,7 @@ def test_a_run_has_no_ensemble_by_itself(run_folder: Path) -> None:
 def test_a_policy_acts_in_bf16_by_itself_only_on_a_gpu_that_has_it(
     kind: str, multiplies: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """No processor's features decide what a policy answers."""
+    """The processor's features do not decide what a policy answers."""
     monkeypatch.setattr(devices, "multiplies_bf16", lambda _: multiplies)
     device = torch.device(kind)
     found = devices.acting_precision(device, "auto")
@@ -547,7 +547,7 @@ def test_what_a_policy_answers_in_bf16_is_nearly_what_it_answers_in_float32(
 def test_policies_of_the_same_weights_act_one_after_the_other(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A backbone's hooks would note what is read in two passes at once as if it were one."""
+    """A backbone's hooks would record the reads of two simultaneous passes as one."""
     policy, at_once, most = deployed(), [], []
     act = policy._policy.act
 

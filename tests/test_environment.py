@@ -1,4 +1,4 @@
-"""What tests and the processes that they start find in their environment."""
+"""The environment of tests and of the processes that they start."""
 
 from __future__ import annotations
 

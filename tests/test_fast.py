@@ -1,4 +1,4 @@
-"""`pytest -m fast`: about a thousand tests, of every room, by a rule that names what exists."""
+"""`pytest -m fast`: about a thousand tests, from every room, by a rule that names real files."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ TESTS = Path(__file__).parent
 
 
 class Collected:
-    """What a session of pytest has collected, as pytest names it."""
+    """The tests that a pytest session has collected, by pytest's names."""
 
     def __init__(self) -> None:
         self.names: list[str] = []
@@ -22,7 +22,7 @@ class Collected:
 
 @pytest.fixture(scope="module")
 def selected() -> list[str]:
-    """The tests that `-m fast` selects; in this process, which has most of them imported."""
+    """The tests that `-m fast` selects, collected in this process, which has most imports."""
     found = Collected()
     options = ["-m", "fast", "--collect-only", "-n", "0", "-p", "no:cacheprovider"]
     assert pytest.main([*options, str(TESTS)], plugins=[found]) == pytest.ExitCode.OK

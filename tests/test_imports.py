@@ -53,7 +53,7 @@ def imports(source: str, module: str) -> Iterator[str]:
 
 
 def violations(source: str, module: str) -> list[str]:
-    """The imports of a module that its room may not have."""
+    """The imports of a module that its room must not have."""
     room = module.split(".")[0]
     return [f"{module} imports {name}" for name in imports(source, module) if not fine(room, name)]
 
@@ -87,7 +87,7 @@ def test_the_package_itself_imports_nothing_before_it_is_asked_for() -> None:
     lazy = {"aegis_cli.guard.Guard", "aegis_cli.deploy.load_policy"}
     lazy.add("aegis_cli.serving.real_time.RealTime")
     assert found == lazy | {"aegis_cli.common.version.__version__", "typing.TYPE_CHECKING"}
-    assert (ROOT / "py.typed").is_file()  # so that a type checker reads what they are
+    assert (ROOT / "py.typed").is_file()  # so that type checkers use its types
     program = """
 import sys, aegis_cli
 assert not {'torch', 'aegis_cli.guard', 'aegis_cli.deploy'} & sys.modules.keys()

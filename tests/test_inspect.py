@@ -1,4 +1,4 @@
-"""`aegis inspect`: every kind of artifact and run, against figures worked out by hand."""
+"""`aegis inspect`: every kind of artifact and run, against hand-computed figures."""
 
 from __future__ import annotations
 
@@ -129,7 +129,7 @@ def test_energy_over_time_is_binned_without_losing_a_step(tmp_path):
 
 
 def test_a_row_of_the_course_is_the_mean_over_its_steps(tmp_path, capsys):
-    """Of 100 steps some bins have two and others one, which are no means of equal weight."""
+    """With 100 steps some bins have two and others one, so their means have unequal weight."""
     steps = 100
     shed = [0.9 if step % 3 == 0 else 0.001 * step for step in range(1, steps + 1)]
     ta = [[-(share**0.5), 0.0] for share in shed]
@@ -163,7 +163,7 @@ def test_a_method_without_anchor_gradient_has_no_energy(tmp_path, capsys):
 
 
 def test_a_ledger_says_how_many_steps_it_has(tmp_path, capsys):
-    """Also one without a row, whose method is not to blame for that."""
+    """This includes a ledger without a row, which is not its method's fault."""
     path = save_ledger(tmp_path / "l.safetensors")
     assert inspection.run(path).facts["steps"] == 2
     empty = save_ledger(tmp_path / "empty.safetensors", [], [], [])
@@ -230,7 +230,7 @@ def test_other_kinds_need_no_more_than_their_header(tmp_path):
 
 
 def test_a_checkpoint_without_its_run_is_a_policy_with_its_backbone(tmp_path, capsys):
-    """As `aegis export --format aegis` writes it."""
+    """In the form that `aegis export --format aegis` writes."""
     (tmp_path / "backbone").mkdir()
     joints = {"action_names": ["pan", "lift"]}
     artifacts.save(tmp_path / "expert.safetensors", "expert", {"w": torch.zeros(2)}, meta=joints)
@@ -300,7 +300,7 @@ def test_a_model_in_a_form_that_no_command_takes_is_named(tmp_path, name, found)
     "name", ["v2_OpenEnded_mscoco_val2014_questions.json", "part.parquet", "dataset_info.json"]
 )
 def test_a_damaged_folder_of_questions_is_told_as_one(name, tmp_path, capfd):
-    """A file of each form that sets of questions have: VQAv2, and Hugging Face's two."""
+    """A file of each form of question set: VQAv2's, and Hugging Face's two."""
     folder = tmp_path / "set"
     folder.mkdir()
     (folder / name).write_text("{}")
@@ -308,7 +308,7 @@ def test_a_damaged_folder_of_questions_is_told_as_one(name, tmp_path, capfd):
         (folder / "state.json").write_text("{}")
     error = refusal(folder)
     assert str(folder) in error.found and "question" in error.expected
-    assert capfd.readouterr().err == ""  # what `datasets` would log of it, the error says
+    assert capfd.readouterr().err == ""  # the error says what `datasets` would log
 
 
 @pytest.mark.parametrize("name", ["plot.png", "notes.txt", "stream.json", "words"])
@@ -451,7 +451,7 @@ def test_verifying_where_nothing_is(aegis, tmp_path: Path) -> None:
 def test_verifying_a_folder_that_only_holds_runs_is_all_there_is_to_say(
     aegis, tmp_path: Path
 ) -> None:
-    """Runs that a link leads to are among them, and a link back up ends somewhere."""
+    """Runs reached through a link are included, and a link back up ends somewhere."""
     save_run(tmp_path / "elsewhere")
     folder = tmp_path / "folder"
     save_run(folder / "runs" / "one")
@@ -461,7 +461,7 @@ def test_verifying_a_folder_that_only_holds_runs_is_all_there_is_to_say(
     assert code == 0 and "2 files agree with their digests" in err
     expected = {"kind": "folder", "path": str(folder), "verified": 2, "without_digest": 0}
     assert json.loads(out) == expected
-    assert aegis("inspect", folder)[0] == 2  # which asks what it is
+    assert aegis("inspect", folder)[0] == 2  # an error that asks for a run
     data = bytearray((tmp_path / "elsewhere" / "ledger.safetensors").read_bytes())
     data[-1] ^= 0x40
     (tmp_path / "elsewhere" / "ledger.safetensors").write_bytes(data)
@@ -492,7 +492,7 @@ print('loaded:', *sorted(sys.modules))
 
 
 def loaded(path: Path) -> set[str]:
-    """The modules that `aegis inspect` of a path has loaded at its end."""
+    """The modules that are loaded at the end of `aegis inspect` on a path."""
     command = [sys.executable, "-c", INSPECTED, str(path)]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     return set(done.stdout.partition("loaded:")[2].split())

@@ -1,4 +1,4 @@
-"""The anchor: what is counted, and that how the samples are dealt does not show in the result."""
+"""The anchor: what it counts, and that the order and batching of samples do not affect it."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def assert_same(a: list[Moments], b: list[Moments]) -> None:
 
 def test_batch_size_and_order_change_nothing(tiny: EmbeddedVLM, asked: VQASet) -> None:
     lengths = {len(q.text.split()) for q in asked.questions}
-    assert len(lengths) > 3  # so every batch pads some of its questions
+    assert len(lengths) > 3  # so every batch pads some questions
     for kind in range(2):
         sixteen = moments.measure(tiny, asked.batches(16), SAMPLES)[kind]
         assert_same(sixteen, moments.measure(tiny, asked.batches(7), SAMPLES)[kind])
@@ -151,7 +151,7 @@ def test_artifact_and_report(
     )
     for stage in ("anchor", "anchor inputs", "anchor inputs spectra", "anchor fisher"):
         told = [e for e in events if e.stage == stage and isinstance(e, Progress)]
-        # A large model's first batch takes minutes: they count, so the stage begins before it.
+        # A large model's first batch takes minutes and counts, so the stage is shown before it.
         assert (told[0].done, told[-1].done) == (0, told[-1].total), stage
     passes = [e for e in events if e.stage == "anchor" and isinstance(e, Progress)]
     assert [(e.done, e.total) for e in passes] == [(n, 60) for n in (0, 16, 32, 48, 60)]
@@ -271,7 +271,7 @@ def test_frames_are_read_with_their_instructions(
 def test_a_process_reads_the_batches_of_its_own_turn_alone(
     rank: int, tiny: EmbeddedVLM, demos_file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Frames that stay in videos are decoded when they are read."""
+    """Frames in videos are decoded only when they are read."""
     shown, read = demonstrations.load(demos_file, 0.5, 0), list[int]()
     monkeypatch.setattr(Ranks, "gathered", lambda _, value: [value])
 

@@ -1,4 +1,4 @@
-"""What an anchor says of a VLM's inputs and parameters, against questions written out by hand."""
+"""An anchor's statistics of a VLM's inputs and parameters, against hand-written computations."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def make_set(image_of: tuple[int, ...] = IMAGE_OF) -> VQASet:
 
 
 def double_tiny() -> EmbeddedVLM:
-    """In float64, its normalisations' scales and shifts not those of an untrained model."""
+    """In float64, with scales and shifts of normalisations unlike an untrained model's."""
     model = double_policy().backbone
     generator = torch.Generator().manual_seed(0)
     with torch.no_grad():
@@ -51,7 +51,7 @@ def double_tiny() -> EmbeddedVLM:
 
 
 def tokens(model: EmbeddedVLM, question: Question) -> tuple[list[int], int]:
-    """Ids of the question with its answer and end, and how many of them ask."""
+    """Ids of the question with its answer and end token, and the length of the prompt."""
     prompt = model.tokenizer.prompt(question.text)
     return [*prompt, *model.tokenizer.encode(question.answer), model.tokenizer.end], len(prompt)
 
@@ -81,9 +81,9 @@ def normalize(x: Tensor, eps: float = 1e-5) -> Tensor:
 
 @torch.no_grad()
 def read(model: EmbeddedVLM, image: np.ndarray, ids: list[int], prompt: int) -> tuple[Rows, Rows]:
-    """What each dense or elementwise site reads of one image and of one text about it.
+    """The inputs of each dense or elementwise site for one image and one text about it.
 
-    Rows [n, d] by site.
+    They are rows [n, d] by site.
     """
     x, of_image, of_text = model.pixels(torch.from_numpy(image)[None])[0], {}, {}
     for i in range(len(model.stem.halve)):
@@ -122,7 +122,7 @@ def read(model: EmbeddedVLM, image: np.ndarray, ids: list[int], prompt: int) -> 
 
 
 def expected(model: EmbeddedVLM, asked: VQASet) -> Rows:
-    """Mean second moment of each site's rows: each image's once, each question's once."""
+    """Mean second moment of each site's rows: each image counts once, each question once."""
     rows: dict[str, list[Tensor]] = {}
     seen: set[int] = set()
     for question, image in zip(asked.questions, asked.image_of.tolist(), strict=True):
@@ -149,7 +149,7 @@ def mean_moment(rows: Tensor, elementwise: bool, bias: bool) -> Tensor:
 
 
 def moments(measured: dict[str, Spectrum]) -> Rows:
-    """Second moments rebuilt from all eigenvectors; of a table, which rows are read."""
+    """Second moments rebuilt from all eigenvectors; for a table, which rows are read."""
     return {
         site: s.values
         if s.vectors is None
@@ -215,7 +215,7 @@ def test_the_order_does_not_show() -> None:
 
 
 def test_padding_never_counts() -> None:
-    """Questions of different lengths together are the sum of each alone, by the tokens each has."""
+    """Questions of different lengths together equal the sum of each alone, weighted by tokens."""
     model, asked = make_tiny(), make_set((0, 1, 2, 3, 4))
     lengths = torch.tensor([float(len(tokens(model, q)[0])) for q in asked.questions])
     assert len(lengths.unique()) > 3
@@ -279,7 +279,7 @@ def test_which_tokens_are_drawn_follows_the_seed_alone() -> None:
 def test_every_process_draws_tokens_of_its_own() -> None:
     rows, drawn = torch.arange(100)[:, None], inputs.Drawn(0.5, 3)
     chosen = [d.of(rows, d.generator()) for d in map(drawn.of_process, range(3))]
-    assert drawn.of_process(0) == drawn  # one process alone draws as ever
+    assert drawn.of_process(0) == drawn  # a single process draws as before
     assert len({tuple(each.flatten().tolist()) for each in chosen}) == 3
 
 
@@ -435,7 +435,7 @@ def test_fisher_is_positive_where_something_is_read_and_zero_elsewhere() -> None
     used = information["text_position.weight"].sum(1) > 0
     assert (
         used[: longest - 1].all() and not used[longest - 1 :].any()
-    )  # nothing is said after the end
+    )  # nothing follows the end token
     assert (information["words.weight"].sum(1) > 0).all()  # the tied head scores every word
 
 
@@ -456,7 +456,7 @@ def test_the_rows_of_a_convolution_times_its_weights_are_its_outputs(
     dilation: int,
     biased: bool,
 ) -> None:
-    """In the order in which the curvature has the gradients at these outputs."""
+    """They are in the same order as the curvature's gradients of these outputs."""
     module = nn.Conv2d(3, 4, kernel, stride, padding, dilation, bias=biased).double()
     x = torch.randn(2, 3, 8, 7, dtype=torch.float64)
     weights = module.weight.flatten(1)
@@ -470,21 +470,21 @@ def test_the_rows_of_a_convolution_times_its_weights_are_its_outputs(
 
 
 def matrix(spectrum: Spectrum) -> Tensor:
-    """What a spectrum holds of its matrix, in float64."""
+    """The matrix that a spectrum represents, in float64."""
     assert spectrum.vectors is not None
     vectors = spectrum.vectors.double()
     return (vectors * spectrum.values[: vectors.shape[1]]) @ vectors.T
 
 
 def of_likeliest(scores: Tensor, uniform: Tensor) -> Tensor:
-    """In place of a draw: the same words whoever asks."""
+    """Replaces a random draw: always the same words."""
     return scores.log_softmax(-1).amax(-1).sum()
 
 
 def inputs_and_gradients(
     model: EmbeddedVLM, asked: VQASet, row: int, site: str, temperature: float
 ) -> tuple[Tensor, Tensor]:
-    """A site's inputs [n, d] and the gradients at its outputs [n, o].
+    """A site's inputs [n, d] and the gradients of its outputs [n, o].
 
     They are of the log likelihood of one answer's likeliest words, by scores over the temperature.
     """
@@ -559,7 +559,7 @@ def test_entropy_is_the_mean_entropy_of_the_answers_words() -> None:
         scores = model(pixels, torch.tensor([[ids]]), torch.tensor([[prompt]]))[0, 0]
         found.append(torch.distributions.Categorical(logits=scores[prompt - 1 : -1]).entropy())
     wanted = torch.cat(found)
-    assert counted.words == len(wanted) > len(found)  # an answer's end is a word too
+    assert counted.words == len(wanted) > len(found)  # an answer's end token counts as a word
     assert counted.mean() == pytest.approx(wanted.mean().item(), rel=1e-4)
 
 
@@ -587,11 +587,11 @@ def test_curvature_does_not_depend_on_the_batch_size(size: int) -> None:
 @pytest.mark.parametrize("words", [2, 7, 300])
 def test_words_are_drawn_as_often_as_their_scores_say(words: int) -> None:
     scores = torch.randn(words, generator=torch.Generator().manual_seed(words)).double()
-    scores[words // 2] = -math.inf  # never said
+    scores[words // 2] = -math.inf  # never drawn
     uniform = torch.linspace(0, 1, 10_001, dtype=torch.float64)[:-1]
     rows = scores.repeat(10_000, 1).requires_grad_()
     curvature._log_likelihood(rows, uniform).backward()
-    # d log p(word) / d scores is 1 at the drawn word, less the chances themselves.
+    # d log p(word) / d scores is 1 at the drawn word, minus the probabilities.
     chances = scores.softmax(-1)
     drawn = (rows.grad + chances).mean(0)
     torch.testing.assert_close(drawn, chances, rtol=0, atol=2e-4)

@@ -1,4 +1,4 @@
-"""Maps that read the same tensor, maps too wide to be summed whole, and sums in groups."""
+"""Maps that read the same tensor, maps too wide for an exact sum, and sums in groups."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ WIDTH, OUT = 12, (8, 4, 4)  # of the input, and of queries, keys and values
 
 
 class Apart(nn.Module):
-    """Queries, keys and values as three maps of one tensor, then a map of their own."""
+    """Queries, keys and values as three maps of one tensor, then a map with another input."""
 
     def __init__(self, seed: int = 0) -> None:
         super().__init__()
@@ -47,7 +47,7 @@ class Apart(nn.Module):
 
 
 class Fused(nn.Module):
-    """The same function with one map in place of the three."""
+    """The same function with one map instead of the three."""
 
     def __init__(self, apart: Apart) -> None:
         super().__init__()
@@ -62,7 +62,7 @@ class Fused(nn.Module):
 
 
 class Twice(Apart):
-    """Values read something else in every other pass."""
+    """Values read a different tensor in every other pass."""
 
     passes = 0
 
@@ -132,7 +132,7 @@ def test_the_curvature_of_such_maps_is_that_of_the_fused_map() -> None:
     whole, start = matrix(fused["qkv.outputs"]), 0
     for name, out in zip(("query", "key", "value"), OUT, strict=True):
         own = slice(start, start + out)
-        # The other factor's trace weighs a map's own inputs alike, fused or not.
+        # The other factor's trace weights a map's own inputs alike, fused or not.
         assert_same(matrix(found[f"{name}.outputs"]), whole[own, own], 1e-5)
         start += out
 
@@ -254,7 +254,7 @@ def test_the_groups_are_as_large_as_the_budget_lets_them_be() -> None:
 def test_a_sketched_map_protects_as_its_exact_spectrum_does(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """What updates still do to outputs on VQA, projected by either."""
+    """The effect that updates still have on VQA outputs after projection by either."""
     model, questions = make_tiny(), asked()
     exact = inputs.measure(model, questions, 1.0)
     monkeypatch.setattr(moment_sums, "_FEWEST_COLUMNS", 40)

@@ -19,7 +19,7 @@ from typing import Any
 
 TESTS = Path(__file__).parent.parent
 sys.path.insert(0, str(TESTS))
-os.environ["OMP_NUM_THREADS"] = "1"  # a process that has threads does not fork well
+os.environ["OMP_NUM_THREADS"] = "1"  # a process with threads does not fork well
 os.environ["HF_HUB_OFFLINE"] = "1"
 os.environ["AEGIS_CACHE"] = "cache"  # in the folder of each case
 os.environ.pop("COLUMNS", None)
@@ -76,7 +76,7 @@ def _options() -> argparse.Namespace:
 def _each(
     kind: str, numbers: Iterable[int], run: Callable[[int], Any], state: Path, again: bool
 ) -> None:
-    """Try the cases that the state does not know yet; with `again`, those that failed alone."""
+    """Try the cases that are not in the state yet; with `again`, those that failed alone."""
     own = [line for line in figures.read([state]) if line["kind"] == kind]
     known = {line["case"] for line in own}
     if again:
@@ -95,7 +95,7 @@ def _each(
 
 
 def _report(options: argparse.Namespace) -> int:
-    """Print what became of all cases; 1 if one of them failed."""
+    """Print the results of all cases; 1 if one of them failed."""
     found = figures.read([options.state, *options.others])
     print(figures.table(found))
     if options.page is not None:

@@ -1,4 +1,4 @@
-"""What became of a campaign's cases, as a table for docs/reliability.md."""
+"""The results of a campaign's cases, as a table for docs/reliability.md."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Line = dict[str, Any]
 
 
 def read(states: Iterable[Path]) -> list[Line]:
-    """The results in some files; of a case that was tried again, the last one."""
+    """The results in some files; for a case that was tried again, the last one."""
     found: dict[tuple[str, int], Line] = {}
     for state in states:
         for text in state.read_text().splitlines() if state.exists() else ():
@@ -23,7 +23,7 @@ def read(states: Iterable[Path]) -> list[Line]:
 
 
 def failures(lines: Iterable[Line]) -> list[Line]:
-    """The cases that ended otherwise than they may."""
+    """The cases with an outcome that is not allowed."""
     return [line for line in lines if line["problem"]]
 
 
@@ -40,7 +40,7 @@ def table(lines: Sequence[Line]) -> str:
 
 
 def write(page: Path, lines: Sequence[Line]) -> None:
-    """Put the table into a page, between its marks."""
+    """Put the table into a page, between its markers."""
     before, _, rest = page.read_text(encoding="utf-8").partition(_BEGIN)
     after = rest.partition(_END)[2]
     made = f"{before}{_BEGIN}\n\n{table(lines)}\n\n{_END}{after}"

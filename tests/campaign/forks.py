@@ -1,6 +1,6 @@
 """The command in a forked child: it finds every module imported, so that a case takes little time.
 
-A child has a process group, an address space and a time of its own.
+A child has its own process group, address space and time limit.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NoReturn
 
-# What a case may take beyond what is mapped when it starts: a defect that asks for more is found.
-# Smaller than this, threads that share torch's libraries have no room for their own heaps.
+# The memory of a case beyond what is mapped at its start; a defect that needs more is found. With
+# a smaller limit, threads that share torch's libraries have no room for their own heaps.
 MORE_MEMORY = 4 << 30
 TIMEOUT_S = 60.0
 _WAIT_FOR_ORPHANS_S = 10.0
@@ -28,11 +28,11 @@ _WAIT_FOR_ORPHANS_S = 10.0
 
 @dataclass(frozen=True)
 class Ended:
-    """How a child came to its end.
+    """How a child ended.
 
     Attributes:
-        code: its exit code; minus a signal's number where that ended it.
-        hung: whether it was ended for taking too long.
+        code: its exit code; if a signal ended it, minus the signal's number.
+        hung: whether it was killed for taking too long.
         orphans: whether processes of its group outlived it.
     """
 
@@ -63,7 +63,7 @@ class Child:
             os.kill(self.pid, number)
 
     def wait(self, timeout_s: float = TIMEOUT_S) -> Ended:
-        """Wait for its end, which comes at the latest after `timeout_s`."""
+        """Wait for its end, at most `timeout_s`."""
         if hung := not self.has_ended(timeout_s):
             self.kill(signal.SIGKILL, group=True)
         _, status = os.waitpid(self.pid, 0)
@@ -94,7 +94,7 @@ def run(args: Sequence[object], cwd: Path, timeout_s: float = TIMEOUT_S) -> Ende
 
 
 def call(function: Callable[[], object], cwd: Path) -> None:
-    """Call a function in a child, for what it leaves on disk.
+    """Call a function in a child, for the files that it leaves.
 
     Raises:
         RuntimeError: it fails.
@@ -133,7 +133,7 @@ def _fork(
 def _be_child(
     work: Callable[[], object], cwd: Path, limits: Callable[[], None], streams: tuple[int, int]
 ) -> NoReturn:
-    """Do the work as a fresh process would, and leave without what the parent has put off."""
+    """Do the work as a fresh process would, and exit without the parent's exit handlers."""
     code = 1
     try:
         os.setsid()
@@ -156,13 +156,13 @@ def _be_child(
             try:
                 if stream is not None:
                     stream.flush()
-            except (OSError, ValueError):  # nobody reads it, or it was closed
+            except (OSError, ValueError):  # the reader is gone, or it was closed
                 pass
         os._exit(code)
 
 
 def _redirect(stdout: int, stderr: int) -> None:
-    """Streams as Python makes them when it starts; -1 is one that was closed."""
+    """Streams as Python opens them at its start; -1 is a closed one."""
     os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
     for number, source, name in ((1, stdout, "stdout"), (2, stderr, "stderr")):
         if source == -1:
@@ -176,7 +176,7 @@ def _redirect(stdout: int, stderr: int) -> None:
 
 
 def _outlived(group: int) -> bool:
-    """Whether processes of a group are still there after their time to end; ends them."""
+    """Whether processes of a group still exist after their grace period; kills them."""
     given_up = time.monotonic() + _WAIT_FOR_ORPHANS_S
     while time.monotonic() < given_up:
         try:

@@ -1,4 +1,4 @@
-"""Trainings that are ended by signals, at moments drawn from a generator, and go on."""
+"""Trainings that are ended by signals, at random moments, and resumed."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from campaign import forks, world
 from campaign.subjects import contents, leftovers, own_copy, wrong_end
 
 _SIGNALS = (signal.SIGKILL, signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
-_MOST_KILLS = 3  # of one training
+_MOST_KILLS = 3  # per training
 
 
 @dataclass(frozen=True)
 class Work:
-    """A command that can be ended and goes on.
+    """A command that can be interrupted and resumed.
 
     Attributes:
-        begin: it, with its output `new`.
-        again: what is added to go on.
+        begin: the command, with its output `new`.
+        again: what is added to resume it.
         weight: how often it is drawn.
     """
 
@@ -32,7 +32,7 @@ class Work:
     weight: int = 4
 
 
-_STEPS = 12  # of a training
+_STEPS = 12  # per training
 _SHORT = ("--set", f"train.steps={_STEPS}", "--set", "train.checkpoint_every=3")
 WORKS: tuple[Work, ...] = (
     Work("train aegis", ("train", world.RECIPE, *world.TRAIN, *_SHORT, "--out", "new")),
@@ -53,7 +53,7 @@ _LOGGING = ("train aegis", "train nullspace", "train naive")  # a line of metric
 
 @dataclass(frozen=True)
 class Verdict:
-    """What became of a case; `problem` is "" where all is well."""
+    """The result of a case; `problem` is "" if all is well."""
 
     case: int
     work: str
@@ -63,14 +63,14 @@ class Verdict:
 
 
 class Cases:
-    """Numbered cases: the same number draws the same signals and moments."""
+    """Numbered cases: the same number gives the same signals and moments."""
 
     def __init__(self, root: Path, scratch: Path, seed: int = 0) -> None:
         self._root, self._scratch, self._seed = root, scratch, seed
         self._whole: dict[Work, tuple[float, dict[str, str]]] = {}
 
     def run(self, number: int) -> Verdict:
-        """End a command once or several times, let it go on, and compare what it leaves."""
+        """Interrupt a command once or several times, resume it, and compare its output."""
         rng = Random(f"{self._seed} kill {number}")
         work = rng.choices(WORKS, [work.weight for work in WORKS])[0]
         seconds, tree = self._undisturbed(work)
@@ -93,13 +93,13 @@ class Cases:
     def _kill(
         self, work: Work, place: Path, rng: Random, seconds: float, again: bool
     ) -> tuple[str, int, str]:
-        """Start the command and send it a signal; returns that, the exit code and a problem."""
+        """Start the command and send a signal; returns the signal, the exit code and a problem."""
         number = rng.choice(_SIGNALS)
         before = set(leftovers(place))
         after, more = rng.randrange(_STEPS), rng.uniform(0.0, 0.1)
         child = forks.start([*work.begin, *(work.again if again else ())], place)
         if work.name in _LOGGING:
-            # By its steps: a moment by the clock comes too late as soon as the machine is quick.
+            # By its steps: on a fast machine, a moment by the clock would come too late.
             while not child.has_ended(0.005) and _steps(place) < after:
                 pass
             moment = more
@@ -111,10 +111,10 @@ class Cases:
         return number.name, ended.code, self._wrong(ended, number, set(leftovers(place)) - before)
 
     def _wrong(self, ended: forks.Ended, number: signal.Signals, left: set[str]) -> str:
-        if ended.code == 0:  # it was done before the signal came
+        if ended.code == 0:  # it was done before the signal arrived
             return wrong_end(ended)
         killed = number == signal.SIGKILL
-        # Before the command listens, a signal ends the process as it does any other.
+        # Before the command has its handlers, a signal ends the process as usual.
         expected = {-number} if killed else {128 + number, -number}
         if ended.code not in expected:
             return f"{number.name}: {ended.code}: {ended.err[-1500:]}"
@@ -158,13 +158,13 @@ class Cases:
 
 
 def _steps(place: Path) -> int:
-    """How many steps are logged."""
+    """The number of logged steps."""
     log = place / "new" / "metrics.jsonl"
     return log.read_bytes().count(b"\n") if log.is_file() else 0
 
 
 def output(place: Path) -> dict[str, str]:
-    """What a command has left beside the world, but for pages with their times."""
+    """What a command has left beside the world, except pages, which contain times."""
     return {
         name: digest
         for name, digest in contents(place, place).items()

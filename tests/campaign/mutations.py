@@ -1,4 +1,4 @@
-"""Damage to a file, drawn from a generator: equal seeds do equal damage."""
+"""Random damage to a file: equal seeds do equal damage."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from typing import Any
 import safetensors.torch
 import torch
 
-# Values where others were expected.
+# Values in place of the expected ones.
 _NASTY: tuple[Any, ...] = (
     None,
     True,
@@ -47,7 +47,7 @@ _NASTY: tuple[Any, ...] = (
     {"": None},
     [1, "a", None],
 )
-# Pieces of text that mean something to a reader of YAML or JSON.
+# Pieces of text with a meaning in YAML or JSON.
 _TOKENS = (
     '!!int ""',
     "!!bool maybe",
@@ -78,7 +78,7 @@ _DTYPES = ("F64", "F32", "F16", "BF16", "I64", "I32", "U8", "BOOL", "F8_E4M3", "
 
 @dataclass(frozen=True)
 class Damage:
-    """What was done to a file.
+    """The damage that was done to a file.
 
     Attributes:
         sealed: whether a digest of the undamaged content is still in the file, if there was one.
@@ -115,7 +115,7 @@ def _draw(rng: Random, suffix: str, data: bytes) -> tuple[str, Change]:
     elif suffix in (".yaml", ".yml"):
         fitting |= _TEXT
     names = sorted(fitting)
-    # What knows the format is as likely as what does not.
+    # Changes that know the format are as likely as others.
     own = [name for name in names if name not in _BYTES]
     name = rng.choice(own if own and rng.random() < 0.6 else names)
     return name, fitting[name]
@@ -125,7 +125,7 @@ def _draw(rng: Random, suffix: str, data: bytes) -> tuple[str, Change]:
 
 
 def _place(rng: Random, data: bytes) -> int:
-    """A position, as often in the first thousand bytes as anywhere: headers lie there."""
+    """A position, half the time in the first thousand bytes, where headers are."""
     end = min(1000, len(data)) if rng.random() < 0.5 else len(data)
     return rng.randrange(end) if end else 0
 
@@ -213,7 +213,7 @@ def _line(rng: Random, data: bytes) -> bytes:
 
 
 def _token(rng: Random, data: bytes) -> bytes:
-    """Something that means something, in the middle of a line or as a key's value."""
+    """A meaningful piece of text, in the middle of a line or as a key's value."""
     lines = data.split(b"\n")
     at = rng.randrange(len(lines))
     token = rng.choice(_TOKENS).encode()
@@ -240,7 +240,7 @@ _TEXT: dict[str, Change] = {"lines": _line, "token": _token, "value": _value}
 
 
 def damaged_json(rng: Random, data: bytes) -> bytes:
-    """A damaged document, or one of the lines of a file that has a document a line."""
+    """A damaged document, or a file of JSON lines with one of them damaged."""
     try:
         return json.dumps(_damaged(rng, json.loads(data))).encode()
     except ValueError:
@@ -255,7 +255,7 @@ def damaged_json(rng: Random, data: bytes) -> bytes:
 
 
 def _nested(rng: Random, data: bytes) -> bytes:
-    """Brackets of a depth that no recursion survives, in place of a value."""
+    """Brackets nested too deeply for any recursion, in place of a value."""
     depth = rng.choice((500, 5000, 200_000))
     deep = b"[" * depth + b"]" * depth
     before, colon, after = data.partition(b":")
@@ -266,7 +266,7 @@ _JSON: dict[str, Change] = {"JSON value": damaged_json, "JSON of great depth": _
 
 
 def _damaged(rng: Random, document: Any) -> Any:
-    """The document with one of its values exchanged, left out, renamed or moved."""
+    """The document with one of its values replaced, left out, renamed or moved."""
     holders = list(_holders(document))
     if not holders or rng.random() < 0.03:
         return rng.choice(_NASTY)
@@ -278,7 +278,7 @@ def _damaged(rng: Random, document: Any) -> Any:
     elif what == 1 and isinstance(holder, dict):
         holder[str(rng.choice(_NASTY))[:50]] = holder.pop(key)
     elif what == 2:
-        holder[key] = copy.deepcopy(other[its])  # which may be what holds it
+        holder[key] = copy.deepcopy(other[its])  # which may contain it
     elif isinstance(holder[key], int | float) and what == 3:
         holder[key] = rng.choice((-holder[key], holder[key] + 1, str(holder[key]), [holder[key]]))
     else:
@@ -287,7 +287,7 @@ def _damaged(rng: Random, document: Any) -> Any:
 
 
 def _holders(document: Any) -> Iterator[tuple[Any, Any]]:
-    """Every place of a value: what holds it, and its key or number there."""
+    """Every place of a value: its container, and its key or index there."""
     if isinstance(document, dict):
         places: Sequence[Any] = list(document)
     elif isinstance(document, list):
@@ -315,7 +315,7 @@ def _joined(table: Any, rest: bytes) -> bytes:
 
 
 def _header(rng: Random, data: bytes) -> bytes:
-    """Another value in what Aegis says of the file."""
+    """Another value in Aegis' own part of the header."""
     table, rest = _parts(data)
     aegis = table.get("__metadata__", {}).get("aegis")
     if aegis is None:
@@ -325,7 +325,7 @@ def _header(rng: Random, data: bytes) -> bytes:
 
 
 def _old_header(rng: Random, data: bytes) -> bytes:
-    """The same in a file that looks like one of before there were digests."""
+    """The same in a file that looks as if it were from before digests."""
     table, rest = _parts(data)
     aegis = json.loads(table["__metadata__"]["aegis"])
     aegis.pop("digest", None)
@@ -334,7 +334,7 @@ def _old_header(rng: Random, data: bytes) -> bytes:
 
 
 def _header_text(rng: Random, data: bytes) -> bytes:
-    """Text in place of the header, or too deep for a recursion."""
+    """Text in place of the header, or one nested too deeply for recursion."""
     table, rest = _parts(data)
     deep = "[" * rng.choice((900, 100_000))
     nasty = ("", "null", "[]", "{", deep, '{"kind":"demos"}', "\x1b[2J")
@@ -343,7 +343,7 @@ def _header_text(rng: Random, data: bytes) -> bytes:
 
 
 def _table(rng: Random, data: bytes) -> bytes:
-    """Another shape, type or place of a tensor."""
+    """Another shape, dtype or offset of a tensor."""
     table, rest = _parts(data)
     names = sorted(name for name in table if name != "__metadata__")
     said = table[rng.choice(names)]
@@ -358,7 +358,7 @@ def _table(rng: Random, data: bytes) -> bytes:
         said["data_offsets"] = rng.choice(([0, 0], [0, 2**50], [8, 0], said["data_offsets"][::-1]))
     else:
         table[rng.choice(("other", names[0] + "x", ""))] = said
-    # The same table in other words would be the same file, of another digest.
+    # The same table written differently would be the same file, with another digest.
     return _flip(rng, data) if table == _parts(data)[0] else _joined(table, rest)
 
 
@@ -369,14 +369,14 @@ def _length(rng: Random, data: bytes) -> bytes:
 
 
 def _forged(rng: Random, data: bytes) -> bytes:
-    """Another tensor in a file that looks like one of before there were digests."""
+    """Another tensor in a file that looks as if it were from before digests."""
     tensors = safetensors.torch.load(data)
     table, _ = _parts(data)
     aegis = json.loads(table["__metadata__"]["aegis"])
     aegis.pop("digest", None)
     name = rng.choice(sorted(tensors))
     tensors[name] = _other_tensor(rng, tensors[name])
-    if rng.random() < 0.5:  # the header agrees
+    if rng.random() < 0.5:  # the header is adapted
         dtype = str(tensors[name].dtype).removeprefix("torch.")
         aegis["tensors"][name] |= {"shape": list(tensors[name].shape), "dtype": dtype}
     if rng.random() < 0.1:

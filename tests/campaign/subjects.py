@@ -1,4 +1,4 @@
-"""What is damaged, and the command that reads it."""
+"""Files to damage, and the commands that read them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from typing import Any
 from campaign import forks, world
 from campaign.mutations import damage
 
-# Figures of a report or a log that differ from repetition to repetition.
+# Values of a report or a log that differ between repetitions.
 _TIMES = {
     *("data_s", "update_s", "step_s", "samples_per_s", "episodes_per_s", "step_time_ratio"),
     *("minutes", "seconds", "out", "outputs", "trained_on", "split"),
@@ -28,10 +28,10 @@ class Subject:
     """A kind of file, and a command that reads it.
 
     Attributes:
-        files: patterns of the files to damage, from the world's folder.
-        args: of the command that reads them.
-        digest: whether their content is told by a digest; what has none may be read as another
-            file of its kind, if it is one.
+        files: patterns of the files to damage, relative to the world's folder.
+        args: arguments of the command that reads them.
+        digest: whether a digest verifies their content; a file without one may be read as another
+            valid file of its kind.
         weight: how often it is drawn.
         writes: the folder that the command writes, whose content is compared too.
     """
@@ -48,7 +48,7 @@ _RESUME = ("train", "small.yaml", *world.TRAIN, "--out", "begun", "--resume", "-
 _STATE = "begun/checkpoints/last/training_state/state.safetensors"
 _ASKED = ("--questions", "14", "--json")
 _POLICY = ("run/checkpoints/last/backbone/*.safetensors", "run/checkpoints/last/expert.safetensors")
-# Which episodes are held out would depend on whether the file's bytes are those of the training.
+# The held-out episodes would depend on whether the file's bytes are those of the training.
 _EVALUATED = ("--demos", world.DEMOS, "--episodes", "0-3", "--frames", "4", "--json")
 _EVALUATE = ("evaluate", "run", *_EVALUATED)
 
@@ -183,7 +183,7 @@ SUBJECTS: tuple[Subject, ...] = (
 
 @dataclass(frozen=True)
 class Verdict:
-    """What became of a case; `problem` is "" where all is well."""
+    """The result of a case; `problem` is "" if all is well."""
 
     case: int
     subject: str
@@ -194,18 +194,18 @@ class Verdict:
 
 
 class Cases:
-    """Numbered cases: the same number is the same damage to the same file."""
+    """Numbered cases: the same number gives the same damage to the same file."""
 
     def __init__(
         self, root: Path, scratch: Path, seed: int = 0, subjects: Sequence[Subject] = SUBJECTS
     ) -> None:
-        """Take the world in `root`; cases are tried in folders below `scratch`."""
+        """Use the world in `root`; cases run in folders below `scratch`."""
         self._root, self._scratch, self._seed = root, scratch, seed
         self._subjects = subjects
         self._whole: dict[Subject, tuple[forks.Ended, dict[str, str]]] = {}
 
     def run(self, number: int) -> Verdict:
-        """Damage a file, and let its command read it."""
+        """Damage a file, and run the command that reads it."""
         rng = Random(f"{self._seed} {number}")
         subject = rng.choices(self._subjects, [subject.weight for subject in self._subjects])[0]
         place = self._fresh(number)
@@ -239,14 +239,14 @@ class Cases:
                 return f"other output without an error: {ended.out[-2000:]}"
             found = contents(place / subject.writes, place) if subject.writes else {}
             other = {name for name in tree | found if tree.get(name) != found.get(name)}
-            # What was damaged where nothing is read is still there.
+            # Damage to parts that are never read is still there.
             damaged = (self._root / file).resolve().relative_to(self._root.resolve())
             if other - {"/".join(damaged.parts[1:])}:
                 return f"other files without an error: {', '.join(sorted(other))}"
         return ""
 
     def _undamaged(self, subject: Subject, file: Path) -> tuple[forks.Ended, dict[str, str]]:
-        """What the command says and writes where nothing is damaged."""
+        """The command's output and files without any damage."""
         if subject not in self._whole:
             place = self._fresh(-1)
             own_copy(self._root, place, {file.parts[0], subject.writes or ""})
@@ -300,7 +300,7 @@ def wrong_end(ended: forks.Ended) -> str:
 
 
 def leftovers(place: Path) -> list[str]:
-    """Temporary files and folders that somebody forgot."""
+    """Temporary files and folders that were left behind."""
     return [
         str(path.relative_to(place))
         for path in place.rglob("*")
@@ -309,7 +309,7 @@ def leftovers(place: Path) -> list[str]:
 
 
 def figures(out: str) -> Any:
-    """What a command said, without what differs from repetition to repetition."""
+    """A command's output, without the parts that differ between repetitions."""
     try:
         return _timeless(json.loads(out))
     except ValueError:
@@ -317,10 +317,10 @@ def figures(out: str) -> Any:
 
 
 def contents(folder: Path, place: Path) -> dict[str, str]:
-    """Every file below a folder by its digest, links by their targets.
+    """Every file below a folder with its digest, links with their targets.
 
     Args:
-        place: the folder of the case, whose own path in a JSON file makes no difference.
+        place: the folder of the case, whose own path in a JSON file does not count.
     """
     found = {}
     for path in sorted(folder.rglob("*")):

@@ -1,4 +1,4 @@
-"""A selection of the campaign: what README's test command runs of it in half a minute."""
+"""A selection of the campaign: the part that README's test command runs in half a minute."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ MUTATIONS, KILLS = 60, 2
 
 
 def test_no_damage_no_signal_and_no_trouble_ends_in_a_defect(tmp_path: Path) -> None:
-    """Each is read as what it was, or refused with one clear error; what was ended goes on."""
+    """Each file is read as it was, or refused with one clear error; interrupted work resumes."""
     counts = ("--mutations", str(MUTATIONS), "--kills", str(KILLS), "--troubles", "9")
     state = tmp_path / "state.jsonl"
     command = [sys.executable, "tests/campaign", *counts, "--state", str(state)]
@@ -32,6 +32,6 @@ def test_no_damage_no_signal_and_no_trouble_ends_in_a_defect(tmp_path: Path) -> 
     lines = [json.loads(line) for line in state.read_text().splitlines()]
     tried = Counter(line["kind"] for line in lines)
     assert (tried["mutations"], tried["kills"]) == (MUTATIONS, KILLS)
-    # Nothing is proven by a campaign in which nothing is refused, or nothing read.
+    # A campaign in which nothing is refused, or nothing read, proves nothing.
     codes = {line["code"] for line in lines if line["kind"] == "mutations"}
     assert codes == {0, 2}

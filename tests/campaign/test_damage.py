@@ -1,4 +1,4 @@
-"""The campaign's own parts: damage that can be repeated, and a judge that sees what is wrong."""
+"""The campaign's own parts: repeatable damage, and a judge that finds what is wrong."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def original(folder: Path, suffix: str) -> Path:
 
 
 def look(path: Path) -> bytes | str:
-    """What is there, without waiting for a pipe."""
+    """The content, without waiting for a pipe."""
     if path.is_symlink():
         return str(path.readlink())
     if path.is_file():
@@ -69,7 +69,7 @@ def test_a_file_that_lost_its_digest_is_not_taken_for_a_sealed_one(tmp_path: Pat
 @settings(derandomize=True, database=None, max_examples=60)
 @given(document=JSON, seed=st.integers(0, 2**32))
 def test_any_json_can_be_damaged(document: object, seed: int) -> None:
-    """And what comes of it can be written again, so that a case never ends the campaign."""
+    """And the result can be written again, so a case never ends the campaign."""
     text = json.dumps(document).encode()
     changed = mutations.damaged_json(Random(seed), text)
     json.loads(changed)

@@ -52,7 +52,7 @@ _COUNTING: tuple[tuple[str, ...], ...] = (
     *((*command, option, f"new-{command[0]}") for command, option in _WRITERS[1:3]),
     ("merge", "run", "--method", "factors", "--vqa", world.ASKED, "--out", "new-merge"),
 )
-# The ends of what options and keys take, and past them. Large counts are legal, and take long.
+# The limits of options and keys, and values beyond. Large counts are valid, and take long.
 _ODD: dict[type, tuple[str, ...]] = {
     int: ("-100000000000000000000", "-1", "0", "1", "2"),
     float: ("-1", "-0.0", "0", "1e-300", "1e-30", "1", "1e30", "1e300", "inf", "nan"),
@@ -61,7 +61,7 @@ _ODD: dict[type, tuple[str, ...]] = {
 
 @dataclass(frozen=True)
 class Verdict:
-    """What became of a case; `problem` is "" where all is well."""
+    """The result of a case; `problem` is "" if all is well."""
 
     case: int
     trouble: str
@@ -72,7 +72,7 @@ class Verdict:
 
 @dataclass
 class Case:
-    """A folder to work in, and what chance decides."""
+    """A folder to work in, and the random choices."""
 
     place: Path
     rng: Random
@@ -91,7 +91,7 @@ Outcome = tuple[str, int, str]  # what was tried, the exit code, a problem or ""
 
 
 def two_writers(case: Case) -> Outcome:
-    """Two trainings into one folder: one of them is refused, and the other as if alone."""
+    """Two trainings into one folder: one of them is refused, and the other is unaffected."""
     first = forks.start([*_TRAIN, "--out", "new"], case.place)
     time.sleep(case.rng.uniform(0, case.seconds))
     second = forks.start([*_TRAIN, "--out", "new"], case.place).wait()
@@ -105,7 +105,7 @@ def two_writers(case: Case) -> Outcome:
 
 
 def overwritten_input(case: Case) -> Outcome:
-    """Bytes of an input change while it is trained on: an error, or nothing was read of them."""
+    """Bytes of an input change during training: an error, or none of them were read."""
     name = case.rng.choice((world.DEMOS, world.ANCHOR))
     child = forks.start([*_TRAIN, "--out", "new"], case.place)
     done = child.has_ended(case.rng.uniform(0, case.seconds))
@@ -126,7 +126,7 @@ def overwritten_input(case: Case) -> Outcome:
 
 
 def cut_input(case: Case) -> Outcome:
-    """An input is cut while it is mapped: an error, or the system's signal with a message."""
+    """An input is truncated while it is mapped: an error, or the system's signal with a message."""
     child = forks.start([*_TRAIN, "--out", "new"], case.place)
     child.has_ended(case.rng.uniform(0, case.seconds))
     os.truncate(case.place / world.DEMOS, 4096)
@@ -138,7 +138,7 @@ def cut_input(case: Case) -> Outcome:
 
 
 def touched_input(case: Case) -> Outcome:
-    """The time of an input changes while it is trained on: nothing happens."""
+    """The time of an input changes during training: nothing happens."""
     child = forks.start([*_TRAIN, "--out", "new"], case.place)
     while not child.has_ended(0.02):
         os.utime(case.place / world.DEMOS)
@@ -151,7 +151,7 @@ def touched_input(case: Case) -> Outcome:
 
 
 def full_disk(case: Case) -> Outcome:
-    """No more room: an error, and where there is room again the training goes on."""
+    """No more room: an error, and once there is room again the training resumes."""
     room = int(2 ** case.rng.uniform(10, 22))
     with _full(case.place / "disk", room) as (how, limits):
         command = [*_TRAIN, "--out", "disk/new"]
@@ -169,7 +169,7 @@ def full_disk(case: Case) -> Outcome:
 
 
 def odd_output(case: Case) -> Outcome:
-    """An output that is a device, a pipe, a folder or in a folder that is not there."""
+    """An output that is a device, a pipe, a folder, or in a missing folder."""
     command, option = case.rng.choice(_WRITERS)
     kind = case.rng.choice(("device", "pipe", "link to a device", "no folder", "long name"))
     suffix = {"--plot": ".png", "--predictions": ".jsonl"}.get(option, "")
@@ -194,7 +194,7 @@ def odd_output(case: Case) -> Outcome:
 
 
 def closed_streams(case: Case) -> Outcome:
-    """Nobody reads, or there is no stdout at all: the exit code stays, or says that."""
+    """No reader, or no stdout at all: the exit code is unchanged, or reports that."""
     command = case.rng.choice(_READERS)
     usual = forks.run(command, case.place).code
     how = case.rng.choice(("closed", "nobody reads", "full"))
@@ -213,7 +213,7 @@ def closed_streams(case: Case) -> Outcome:
 
 
 def little_memory(case: Case) -> Outcome:
-    """`ulimit -v`: done, or an error that names memory."""
+    """`ulimit -v`: success, or an error that names memory."""
     command = case.rng.choice((*_READERS[:6], (*_TRAIN, "--out", "new")))
     more = int(2 ** case.rng.uniform(12, 28))
     ended = forks.start(command, case.place, lambda: forks.limit_memory(more)).wait()
@@ -221,7 +221,7 @@ def little_memory(case: Case) -> Outcome:
 
 
 def odd_value(case: Case) -> Outcome:
-    """A number that nobody would think of: it is taken, or refused by its name."""
+    """An unusual number: it is accepted, or refused by its name."""
     if case.rng.random() < 0.5:
         name, kind = case.rng.choice(_keys())
         given = f"--set {name}={case.rng.choice(_ODD[kind])}"
@@ -237,7 +237,7 @@ def odd_value(case: Case) -> Outcome:
 
 @cache
 def _keys() -> list[tuple[str, type]]:
-    """The keys of a training with `aegis` that are numbers, and which."""
+    """The numeric keys of a training with `aegis`, with their types."""
     hints = get_type_hints(Recipe)
     found = []
     for section in ("train", "expert", "aegis"):
@@ -249,7 +249,7 @@ def _keys() -> list[tuple[str, type]]:
 
 @cache
 def _options(name: str) -> list[tuple[str, type]]:
-    """The options of a command that are numbers, and which."""
+    """The numeric options of a command, with their types."""
     command: Any = typer.main.get_command(app)
     found = []
     for option in command.commands[name].params:
@@ -260,7 +260,7 @@ def _options(name: str) -> list[tuple[str, type]]:
 
 
 def _number(hint: Any) -> type | None:
-    """int or float, where a value is one of them or may be left out; else None."""
+    """int or float, if a value is one of them or may be omitted; else None."""
     kinds = [kind for kind in (hint, *get_args(hint)) if kind in (int, float)]
     return kinds[0] if kinds else None
 
@@ -279,7 +279,7 @@ TROUBLES: dict[str, Callable[[Case], Outcome]] = {
 
 
 class Cases:
-    """Numbered cases: the same number draws the same trouble."""
+    """Numbered cases: the same number gives the same trouble."""
 
     def __init__(self, root: Path, scratch: Path, seed: int = 0, only: str = "") -> None:
         self._root, self._scratch, self._seed = root, scratch, seed
@@ -287,7 +287,7 @@ class Cases:
         self._undisturbed: tuple[dict[str, str], float] | None = None
 
     def run(self, number: int) -> Verdict:
-        """Bring about a trouble and judge what becomes of the command."""
+        """Cause a trouble and judge how the command ends."""
         rng = Random(f"{self._seed} trouble {number}")
         name = self._names[number % len(self._names)]
         whole, seconds = self._whole()

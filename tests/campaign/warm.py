@@ -1,6 +1,6 @@
 """Commands run once in this process, so that forked children find what they need imported.
 
-What takes longest is imported here: torch does so itself where the first optimizer is made.
+The slowest imports are done here: torch does them itself when the first optimizer is made.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ def up(root: Path) -> None:
     """Run commands that render nothing: a graphics context would not survive a fork.
 
     Args:
-        root: a world that has begun.
+        root: a world after `world.begin`.
     """
     command = typer.main.get_command(app)
     typer.main.get_command = lambda _: command  # it takes longer to make than most cases
@@ -41,7 +41,7 @@ def up(root: Path) -> None:
         for args in commands:
             _run(command, args)
         shutil.rmtree("warm")
-    # No collection of garbage in a child looks through all this, and copies its memory.
+    # Garbage collections in children then skip these objects, and do not copy their memory.
     gc.collect()
     gc.freeze()
 

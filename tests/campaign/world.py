@@ -38,13 +38,13 @@ STEPS = 4  # of the run
 
 
 class Enough(Exception):
-    """Ends a training that is to go on later."""
+    """Ends a training that is to be resumed later."""
 
 
 def begin(root: Path) -> Path:
-    """Make the files below `root` that every command reads.
+    """Make the files below `root` that the commands read.
 
-    The work is done in children, which leave nothing behind.
+    The work is done in child processes, which leave nothing behind.
     """
     root.mkdir(parents=True, exist_ok=True)
     for make in (_model_and_demos, _recipes, _anchor, _questions, _dataset):
@@ -53,7 +53,7 @@ def begin(root: Path) -> Path:
 
 
 def finish(root: Path) -> None:
-    """Make what commands leave, finished and in progress, in children too."""
+    """Make the outputs of commands, finished and in progress, also in child processes."""
     _done(root, "train", RECIPE, *TRAIN, "--out", "run")
     _done(root, "export", "run", "--format", "lerobot", "--out", "exported")
     _done(root, "train", "stream.yaml", "--out", "stream")
@@ -69,7 +69,7 @@ def _done(root: Path, *args: object) -> None:
         raise RuntimeError(f"aegis {' '.join(map(str, args))}: {ended.code}\n{ended.err}")
 
 
-# --- each is called in the world's folder ---------------------------------------------------------
+# --- each function runs in the world's folder ----------------------------------------------------
 
 
 def _model_and_demos() -> None:
@@ -145,7 +145,7 @@ def _questions() -> None:
 
 
 def _dataset() -> None:
-    """A LeRobot dataset with instructions that the tiny model knows the words of."""
+    """A LeRobot dataset with instructions whose words the tiny model knows."""
     texts = ("go to the red target", "go to the blue target")
     made = [
         dataclasses.replace(episode, instruction=texts[number % len(texts)])

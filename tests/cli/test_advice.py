@@ -1,4 +1,4 @@
-"""A real VLM that is asked about drawn scenes is warned of, once, and the stage goes on."""
+"""Asking a real VLM about drawn scenes gives one warning, and the stage continues."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Said = Callable[[], str]
 
 @pytest.fixture
 def real(tmp_path: Path) -> str:
-    """A folder that looks like a model of the hub; nothing of it is loaded."""
+    """A folder that looks like a model from the hub; nothing in it is loaded."""
     folder = tmp_path / "model"
     folder.mkdir()
     (folder / "config.json").write_text('{"model_type": "paligemma"}')
@@ -183,7 +183,7 @@ def test_the_embedded_vlm_is_sure_of_easy_vqa(
     warned: int,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    # The rest of what a map reads takes seconds, and nothing of it is told here.
+    # Measuring the rest of a map's inputs takes seconds and is not used here.
     monkeypatch.setattr(moment_sums, "make", lambda width, at, *_: TraceOnly(width, at))
     asked = ("anchor", "--backbone", "embedded-easy", "--vqa", questions, "--samples", "60")
     out = tmp_path / "anchor.safetensors"

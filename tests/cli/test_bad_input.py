@@ -1,4 +1,4 @@
-"""What goes wrong for users, through the command line.
+"""User errors, through the command line.
 
 Each ends with exit 2, one error that says what to do, and nothing half-written.
 """
@@ -144,7 +144,7 @@ def test_demonstrations_and_anchor_in_each_others_place_are_told_their_options(
 def test_a_run_whose_path_is_no_text_is_told_so(
     command: str, bad: Callable[..., str], trained: Path, place: Path
 ) -> None:
-    """It is whole, and safetensors says that it is not."""
+    """It is whole, but safetensors says that it is not."""
     run = place / os.fsdecode(b"caf\xe9")
     shutil.copytree(trained, run, symlinks=True)
     out = ("--out", place / "policy") if command == "export" else ()
@@ -193,7 +193,7 @@ def test_demonstrations_of_another_task(bad: Callable[..., str]) -> None:
 def test_an_empty_dataset(
     episodes: int, bad: Callable[..., str], place: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """None at all is no demonstrations file; one leaves nothing to validate on."""
+    """Without episodes it is no demonstrations file; with one, nothing is left for validation."""
     tensors, header = (
         artifacts.load("demos.safetensors").tensors,
         artifacts.read_header("demos.safetensors"),
@@ -217,7 +217,7 @@ def test_zero_episodes(bad: Callable[..., str], trained: Path) -> None:
     bad("run", "small.yaml", "--set", "demos.episodes=0", says=("demos.episodes",))
 
 
-# --- numbers that are none -----------------------------------------------------------------------
+# --- numbers that are not finite -----------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -237,7 +237,7 @@ def test_nan_in_statistics(victim: str, name: str, bad: Callable[..., str], plac
 
 
 def test_a_backbone_whose_activations_overflow(bad: Callable[..., str], place: Path) -> None:
-    """Its weights are finite, what comes out of them is not: no anchor is written."""
+    """Its weights are finite but its activations are not: no anchor is written."""
     model = make_tiny()
     with torch.no_grad():
         model.stem.position.weight.fill_(3e38)

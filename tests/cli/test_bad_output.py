@@ -1,6 +1,6 @@
-"""Where nothing can be written, and Ctrl-C.
+"""Outputs that cannot be written, and Ctrl-C.
 
-There is one clear message, nothing half-written, and runs that go on.
+There is one clear message, nothing half-written, and runs can resume.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ from aegis_cli.common import artifacts, locks
 from aegis_cli.common.events import Progress
 from aegis_cli.training import train
 
-NO_TEXT = os.fsdecode(b"caf\xe9")  # a legal name in another encoding than UTF-8
+NO_TEXT = os.fsdecode(b"caf\xe9")  # a legal name in an encoding other than UTF-8
 
 
 # --- where nothing can be written ----------------------------------------------------------------
 
 
 def outputs(place: str) -> dict[str, tuple[str, ...]]:
-    """Every option that names something to write, by what it writes to."""
+    """Every option that names an output, by what it writes to."""
     return {
         "demos": ("demos", "point", "--episodes", "2", "--out", f"{place}/d.safetensors"),
         "preview": (
@@ -77,7 +77,7 @@ def outputs(place: str) -> dict[str, tuple[str, ...]]:
 def test_a_place_that_cannot_be_written(
     output: str, where: str, bad: Callable[..., str], trained: Path
 ) -> None:
-    """Below something that is no folder, and in a file system without files (for root too)."""
+    """Below something that is not a folder, and in a file system without files (for root too)."""
     bad(
         *(str(trained) if word == "RUN" else word for word in outputs(where)[output]), says=(where,)
     )
@@ -109,7 +109,7 @@ def test_a_folder_where_a_file_is_to_be(
 def test_a_path_that_is_no_text_is_refused_before_the_work(
     command: tuple[str, ...], bad: Callable[..., str], place: Path
 ) -> None:
-    """Nobody could read what would lie there."""
+    """The output there could not be read."""
     (place / NO_TEXT).mkdir()
     bad(*command, says=("caf\\udce9", "not UTF-8", "choose another --out"))
 
@@ -117,7 +117,7 @@ def test_a_path_that_is_no_text_is_refused_before_the_work(
 def test_a_locale_that_cannot_read_a_name_is_told_from_a_name_that_is_no_text(
     place: Path,
 ) -> None:
-    """The user has to change the one or the other."""
+    """The user has to change one or the other."""
     ascii_names = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
     done = subprocess.run(
         [sys.executable, "-m", "aegis_cli", "demos", "point", "--out", "caf\u00e9"],
@@ -162,7 +162,7 @@ def test_a_full_disk_during_pretraining(aegis, place: Path) -> None:
 
 
 def test_pretraining_replaces_no_model_that_it_did_not_begin(bad: Callable[..., str]) -> None:
-    """Nor a finished one, whose state somebody has deleted, after an hour's work."""
+    """Nor a finished one, whose state was deleted by a user, after an hour's work."""
     for resume in ([], ["--resume"]):
         bad(
             "pretrain",
@@ -183,10 +183,10 @@ def interrupted(
     ready: Callable[[int, str], bool],
     number: signal.Signals = signal.SIGINT,
 ) -> str:
-    """Run `aegis` and press Ctrl-C once `ready`, which is told its process id and what it said.
+    """Run `aegis` and press Ctrl-C once `ready`, which is given its process id and its output.
 
-    As a terminal does it, the whole group gets the signal; another than Ctrl-C goes to the command
-    alone, as `kill` sends it.
+    As with a terminal, the whole group gets the signal; a signal other than Ctrl-C goes only to the
+    command, as `kill` sends it.
     """
     said = place.parent / "stderr.txt"
     with processes.aegis(args, place, said) as process:
@@ -195,7 +195,7 @@ def interrupted(
             assert process.exitcode is None, said.read_text()
             time.sleep(0.02)
         (os.killpg if number == signal.SIGINT else os.kill)(process.pid, number)
-        process.join(timeout=300)  # only a hang takes so long
+        process.join(timeout=300)  # only a hang takes this long
         assert process.exitcode == 128 + number
     ended = "interrupted" if number == signal.SIGINT else number.name
     assert "Traceback" not in said.read_text() and said.read_text().count(ended) == 1, (
@@ -206,7 +206,7 @@ def interrupted(
 
 
 def await_end(group: int) -> None:
-    """Wait for the last process of a group, which may still be putting its things away."""
+    """Wait for the last process of a group, which may still be cleaning up."""
     given_up = time.monotonic() + 60
     while time.monotonic() < given_up:
         try:
@@ -218,7 +218,7 @@ def await_end(group: int) -> None:
 
 
 class Enough(Exception):
-    """Ends a training that was only to be resumed."""
+    """Ends a training that only had to be resumed."""
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
@@ -257,14 +257,14 @@ def test_a_signal_leaves_a_run_that_goes_on(place: Path, number: signal.Signals)
 
 
 def starting(pid: int, _: str) -> bool:
-    """The first worker process is there, but has hardly begun to import anything."""
+    """The first worker process exists, but has hardly begun its imports."""
     threads = Path(f"/proc/{pid}/task").iterdir()
     children = [child for thread in threads for child in said_by(thread / "children").split()]
     return any("multiprocessing.spawn" in said_by(Path(f"/proc/{pid}/cmdline")) for pid in children)
 
 
 def said_by(file: Path) -> str:
-    """What the system says of a process or a thread; nothing of one that has just ended."""
+    """What the system says about a process or a thread; empty if it has just ended."""
     try:
         return file.read_text(encoding="utf-8")
     except OSError:
@@ -272,7 +272,7 @@ def said_by(file: Path) -> str:
 
 
 def working(_: int, said: str) -> bool:
-    """Workers have delivered something."""
+    """Workers have delivered results."""
     return "demos: " in said or "render: " in said
 
 
@@ -294,7 +294,7 @@ def test_a_signal_ends_worker_processes_too(
     number: signal.Signals,
     place: Path,
 ) -> None:
-    """None of them prints a traceback of its own, and no output is begun."""
+    """None of them prints a traceback of its own, and no output is started."""
     (place / "empty").mkdir()
     before = snapshot(place)
     interrupted(place, command, moment, number)
@@ -317,7 +317,7 @@ def test_a_second_process_is_refused_and_told_who_is_at_work(
 
 
 def output_of(*command: str, **environment: str) -> str:
-    """What a command that ends well writes to a pipe."""
+    """What a successful command writes to a pipe."""
     done = subprocess.run(
         [sys.executable, "-m", "aegis_cli", *command],
         cwd=ROOT,

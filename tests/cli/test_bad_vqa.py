@@ -37,7 +37,7 @@ def place(tmp_path: Path, tiny_folder: Path, monkeypatch: pytest.MonkeyPatch) ->
 
 @pytest.fixture
 def bad(aegis, place: Path) -> Callable[..., str]:
-    """Measure an anchor and probe: both have to be refused alike and to write nothing."""
+    """Measure an anchor and probe: both must give the same error and write nothing."""
 
     def call(vqa: object, *says: str, options: tuple[str, ...] = ()) -> str:
         before = snapshot(place)
@@ -62,7 +62,7 @@ def bad(aegis, place: Path) -> Callable[..., str]:
 
 @pytest.fixture
 def skipped(aegis, place: Path) -> Callable[[object], int]:
-    """How many questions a probe with --skip-bad leaves out; no bad one is among the answered."""
+    """How many questions a probe with --skip-bad leaves out; no bad one is answered."""
 
     def call(vqa: object) -> int:
         code, out, err = aegis(
@@ -188,9 +188,9 @@ def test_nothing_but_bad_lines(bad: Callable[..., str], place: Path) -> None:
 def test_a_corrupt_image(
     form: str, keep: float, aegis, skipped: Callable[[object], int], place: Path
 ) -> None:
-    """Cut anywhere: the error names the first line about it; without it the others are asked."""
+    """Cut anywhere, the error names the first line about it; without it the others are asked."""
     write_jsonl(place, IMAGES)
-    for i in range(200):  # until one falls to the probe
+    for i in range(200):  # until one belongs to the probe's part
         if sets.share(f"images/bad{i}.{form}") in sets.PARTS["probe"]:
             name = f"images/bad{i}.{form}"
             break
@@ -285,7 +285,7 @@ def test_what_is_no_question_set(vqa: str, bad: Callable[..., str], place: Path)
 
 
 def changed(change: Callable[[list[Any], list[Any]], object]) -> dict[str, Any]:
-    """The pair with something done to its lists."""
+    """The pair with a change to its lists."""
     questions, annotations = copy.deepcopy(official_pair(IMAGES))
     change(questions["questions"], annotations["annotations"])
     return {"questions": questions, "annotations": annotations}

@@ -88,7 +88,7 @@ class Evaluated(Report):
 
 @pytest.fixture
 def stage(monkeypatch):
-    """Replace a stage's `run`; what it was called with is appended to the returned list."""
+    """Replace a stage's `run`; its arguments are appended to the returned list."""
 
     def replace(
         name: str, report: Any = Report(), error: BaseException | None = None
@@ -461,7 +461,7 @@ def test_a_reader_that_has_gone_is_no_error(aegis, stage):
 
 @pytest.mark.parametrize("closed", ["1>&-", "2>&-", "1>&- 2>&-", "| true", "2>&1 | true"])
 def test_closed_streams_change_no_exit_code(closed: str, tmp_path: Path):
-    """A refused command exits with 2, whoever reads it: 1 would be a failed gate."""
+    """A refused command exits with 2 even if its output is not read: 1 would be a failed gate."""
     command = f"'{sys.executable}' -m aegis_cli recipes show nothing {closed}"
     shell = ["bash", "-o", "pipefail", "-c", command]
     done = subprocess.run(shell, cwd=tmp_path, env=finding(ROOT))
@@ -477,13 +477,13 @@ def test_a_gone_reader_ends_a_report_with_a_code_of_its_own(tmp_path: Path):
 
 
 def buffered() -> dict[str, str]:
-    """An environment in which Python gathers what it writes, as it does for users."""
+    """An environment in which Python buffers its output, as it does for users."""
     kept = finding(ROOT)
     kept.pop("PYTHONUNBUFFERED", None)
     return kept
 
 
-# Reports shorter than what Python gathers before it writes, and longer ones.
+# Reports shorter than Python's output buffer, and longer ones.
 @pytest.mark.parametrize(
     "words",
     [
@@ -597,7 +597,7 @@ app.main()
 
 
 def test_a_mapped_file_that_is_cut_ends_with_a_message(tmp_path: Path):
-    """The system ends the process; Python says where it was, and leaves other threads alone."""
+    """The system kills the process; Python says where it was, and leaves other threads alone."""
     (tmp_path / "frames").write_bytes(bytes(8192))
     code = f"""
 import mmap, os, threading
@@ -624,7 +624,7 @@ app.main()
 
 @pytest.mark.parametrize("triton", [False, True])
 def test_a_process_ends_without_looking_through_all_that_it_has_made(triton: bool):
-    """But for that of triton, whose bindings write about whatever is left of them."""
+    """Except for triton's objects, whose bindings print warnings about those that are left."""
     code = f"""
 import gc
 import sys
@@ -768,7 +768,7 @@ def test_options_of_other_trainers_are_told_as_the_documentation_has_them() -> N
     }
     assert other_trainers.KEYS.keys() - documented.keys() == {"lr"}
     for name in other_trainers.KEYS.keys() & documented.keys():
-        # A method is an option here, too.
+        # A method is an option here too.
         keys = {"method" if k == "train.method" else k for k in other_trainers.KEYS[name]}
         assert keys <= set(documented[name]), name
 
@@ -786,7 +786,7 @@ def test_no_key_is_told_where_none_can_be_set(args: tuple[str, ...], aegis) -> N
 
 
 class OutOfMemoryError(RuntimeError):
-    """As torch's for a GPU, by name."""
+    """Like torch's error for a GPU, by name."""
 
 
 @pytest.mark.parametrize(
@@ -834,7 +834,7 @@ def test_of_several_processes_the_launcher_is_named_too(
     aegis, stage, recipe, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     stage("train", error=KeyboardInterrupt())
-    monkeypatch.setattr(stages, "joined", lambda _: contextlib.nullcontext())  # with nobody
+    monkeypatch.setattr(stages, "joined", lambda _: contextlib.nullcontext())  # without others
     command = ("train", recipe, "--demos", "d", "--out", "r")
     for world, local, said in (("2", None, ""), ("4", "2", " --nnodes 2")):
         monkeypatch.setenv("WORLD_SIZE", world)

@@ -41,7 +41,7 @@ def test_the_self_test_runs_every_stage() -> None:
 def test_a_release_of_transformers_that_is_not_known_is_found(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """As one that calls a layer with other arguments than those before it."""
+    """For example one that calls a layer with other arguments than earlier releases."""
     from aegis_cli.models.backbones.hf import HFBackbone
 
     def fails(*_: object) -> None:

@@ -70,7 +70,7 @@ def test_the_job_by_hand(
         and probed["layers"][1]["w2"] > 0
     )
     kept = json.loads((tmp_path / "runs/x/results/probe-scenes.json").read_text())
-    asked = probed.pop("asked")  # the kept one has settings in its place
+    asked = probed.pop("asked")  # the kept report has settings instead
     assert (asked["questions"], asked["anchor"]) == (14, "anchor.safetensors")
     assert kept.items() >= probed.items() and kept["settings"]["questions"] == 14
     assert kept["wrong"] and {one["family"] for one in kept["wrong"]} <= kept["families"].keys()
@@ -170,7 +170,7 @@ def test_the_same_commands_give_the_same_bytes(
 def commands(text: str) -> Iterator[list[str]]:
     """Every `aegis ...` in lines of shell.
 
-    Comments, redirections and what another command says are left out.
+    Comments, redirections and the output of other commands are left out.
     """
     for line in re.sub(r"\\\n\s*", " ", text).splitlines():
         words: list[str] = []
@@ -201,7 +201,7 @@ def accept(args: list[str]) -> None:
 
 @pytest.mark.parametrize("name", list(COMMANDS))
 def test_every_helps_example_is_accepted(name: str) -> None:
-    help_text = re.sub(r" \\\n\s+", " ", COMMANDS[name].help or "")  # a line that goes on
+    help_text = re.sub(r" \\\n\s+", " ", COMMANDS[name].help or "")  # a continued line
     examples = re.findall(r"Example: (aegis .+)", help_text)
     assert examples
     for example in examples:

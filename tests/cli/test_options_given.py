@@ -1,6 +1,6 @@
-"""What is taken of the options that are given: each once, texts as they are meant, demonstrations.
+"""How given options are handled: each once, texts as they are meant, demonstrations.
 
-Advice that names options can be followed as it stands.
+Advice that names options can be followed literally.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The drawings of `aegis report`: their ticks and names can be read."""
+"""The drawings of `aegis report`: their ticks and names are readable."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def draw(seed: int, *size: int) -> list[float]:
 
 
 def learning(seed: int) -> list[tuple[float, float]]:
-    """A figure of any size over some steps, of which there may be a single one."""
+    """A figure of any size over some steps, of which there may be only one."""
     count, power = 1 + seed % 7, -6 + seed % 11
     return [(10 + 3 * k, (0.1 + y) * 10.0**power) for k, y in enumerate(draw(seed, count))]
 
@@ -50,7 +50,7 @@ def test_the_axis_says_its_name_beside_its_ticks(seed: int) -> None:
     chart = drawn(charts.lines([Series("x", learning(seed))], "step", "Time of a step", "time"))
     ends = [tick for tick in texts(chart, "tick") if tick.get("text-anchor") == "end"]
     lefts = [float(tick.get("x", "")) - DIGIT * len(tick.text or "") for tick in ends]
-    assert min(lefts) >= 15  # the name is turned around x = 12
+    assert min(lefts) >= 15  # the name is rotated around x = 12
 
 
 @pytest.mark.parametrize("highest", [2e-4, 2e-5, 1.7e-3, 200_000, 3e7, 40, 0.3])
@@ -62,7 +62,7 @@ def test_ticks_say_the_values_that_they_stand_at(highest: float, log: bool) -> N
 
 
 def spots(seed: int) -> list[Spot]:
-    """Three means with intervals that reach past 100 %."""
+    """Three means with intervals that extend past 100 %."""
     values = draw(seed, 3, 4)
     return [
         Spot(f"method{k}", x, y, (x - 9 * a, x + 9 * a), (y - b, y + b), k)
@@ -119,7 +119,7 @@ def test_drawings_have_no_colours_of_their_own() -> None:
 
 
 def watched(sets: str | list[str]) -> At:
-    """A run that was asked questions of these sets while it trained."""
+    """A run that was asked questions of these sets during training."""
     names = [sets] if isinstance(sets, str) else sets
     fields = ["vqa_drop_points", *(f"vqa_drop_points_{k}" for k in range(2, len(names) + 1))]
     line = {"step": 3, "loss": 1.0} | dict.fromkeys(fields, 0.5)

@@ -1,4 +1,4 @@
-"""Plots: what is drawn where, in which colour, on which scale, and what the titles say."""
+"""Plots: the places, colours and scales of what is drawn, and the titles."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from aegis_cli.inspection import Bin, LayerEnergy
 
 
 def with_methods(report: Any) -> Any:
-    """Each variant a method of its own name."""
+    """Each variant becomes a method with its own name."""
     (task,) = report.tasks
     results = [dataclasses.replace(r, method=r.variant) for r in task.results]
     tuning = [dataclasses.replace(p, method=p.variant) for p in report.tuning]
@@ -45,7 +45,7 @@ def test_at_most_six_methods_have_a_colour_and_every_variant_its_name(count: int
     assert set(names) <= set(written)
     own = [written[name] for name in names if written[name] != frontier._REST]
     assert len(own) == len(set(own)) == min(count, 6) and "naive" in written
-    assert written["naive"] != frontier._REST  # every other is held against it
+    assert written["naive"] != frontier._REST  # every other one is compared with it
     legend = [text.get_text() for text in figure.legends[0].get_texts()]
     assert len(legend) == 4 and not set(names) & set(legend)
 
@@ -81,7 +81,7 @@ def test_the_coloured_curves_say_their_values() -> None:
 def test_up_and_right_is_better_and_an_arrow_says_so() -> None:
     axis = frontier._figure(found(("naive", "x"))).axes[0]
     low, high = axis.get_ylim()
-    assert low > high and axis.get_yscale() == "symlog"  # what is lost grows downwards
+    assert low > high and axis.get_yscale() == "symlog"  # losses point downwards
     (arrow,) = [text for text in axis.texts if text.get_text() == "better"]
     (x, y), (to_x, to_y) = arrow.get_position(), arrow.xy
     assert to_x > x and to_y > y
@@ -121,7 +121,7 @@ def test_a_frontier_without_tuning_shows_the_means() -> None:
 
 
 def test_a_frontier_names_the_task_of_what_it_shows() -> None:
-    """Where what was tuned is none of the tasks that are compared, it has marks of both."""
+    """If the tuned task is not among the compared ones, the frontier has marks of both."""
     report = found(("naive", "a", "x"))
     elsewhere = dataclasses.replace(report, tuning_task="point")
     untuned = dataclasses.replace(report, tuning=[], tuning_task=None)
@@ -175,7 +175,7 @@ def test_a_label_stays_on_the_axis(corner: tuple[float, float]) -> None:
 
 
 def energies(shares: list[list[float]]) -> Any:
-    """A report of as many layers as columns, a bin a row."""
+    """A report with as many layers as columns, and one bin per row."""
     means = np.mean(shares, axis=0)
     layers = [LayerEnergy(f"layer{i}", float(m), 1.0, 0.5) for i, m in enumerate(means)]
     bins = [Bin(i, i, float(np.mean(row)), tuple(row)) for i, row in enumerate(shares)]
@@ -192,7 +192,7 @@ def test_the_energys_title_is_its_finding_and_its_scale_a_log() -> None:
     )
     (heat,) = [c for c in figure.axes[0].collections if c.get_array() is not None]
     assert isinstance(heat.norm, LogNorm) and heat.norm.vmax == pytest.approx(20)
-    assert np.ma.getmaskarray(heat.get_array()).sum() == 1  # what sheds nothing has no colour
+    assert np.ma.getmaskarray(heat.get_array()).sum() == 1  # a layer without shed energy is blank
     assert figure.axes[1].get_yscale() == "log"
 
 
@@ -242,8 +242,8 @@ def test_routing_writes_its_values_and_marks_what_was_pruned() -> None:
 
 
 def test_what_lay_in_memory_before_is_not_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Not even where there is no expert: matplotlib scales what is masked, too, and warns."""
-    most = np.finfo(float).max  # as what has no value may be
+    """Not even without an expert: matplotlib scales masked values too, and warns."""
+    most = np.finfo(float).max  # as uninitialized memory may be
     unset = lambda shape: np.ma.array(np.full(shape, most), mask=True)  # noqa: E731
     monkeypatch.setattr(np.ma, "masked_all", unset)
     routing_figure().draw_without_rendering()
@@ -322,7 +322,7 @@ def test_a_course_has_a_panel_for_each_figure_that_was_logged() -> None:
     assert [*success.lines[0].get_xydata().ravel()] == [2, 25.0]
     bars = [axes.collections[0].get_segments() for axes in (second, success)]
     assert [[*map(tuple, bar)] for (bar,) in bars] == [[(3, 2.0), (3, 5.0)], [(2, 12.5), (2, 100)]]
-    assert first.collections[0].get_segments() == []  # its interval is not known
+    assert first.collections[0].get_segments() == []  # its interval is unknown
     assert drawn._suptitle.get_text() == r"naive in runs/\$x\$"
 
 

@@ -1,4 +1,4 @@
-"""The pages that are written from the code: committed as they are written, and complete."""
+"""The pages generated from the code: committed as generated, and complete."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ DOCS = Path(__file__).parent.parent.parent / "docs"
 def test_the_committed_page_is_the_one_that_the_code_writes(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("COLUMNS", "40")  # no terminal decides
+    monkeypatch.setenv("COLUMNS", "40")  # independent of any terminal
     said = f"run: python -m aegis_cli.cli.reference {DOCS.name}"
     assert (DOCS / name).read_text(encoding="utf-8") == reference.PAGES[name](), said
 
@@ -49,7 +49,7 @@ def test_every_option_of_a_command_has_a_row() -> None:
 
 
 def test_no_option_is_spelled_as_its_metavar() -> None:
-    """As typer 0.27 spelled one of the same letters: `--DEVICE` for `--device DEVICE`."""
+    """As typer 0.27 did if both have the same letters: `--DEVICE` for `--device DEVICE`."""
     seen = 0
     for command in app.registered_commands:
         hints = get_type_hints(command.callback, include_extras=True)

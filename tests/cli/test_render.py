@@ -199,7 +199,7 @@ def test_finished_bars_become_lines_so_that_the_one_at_work_is_seen():
             live(Progress(f"[{i}]/train", 1, 2, "steps"))
             live(Progress(f"[{i}]/train", 2, 2, "steps", {"loss": 0.5}))
         live(Progress("study", 3, 60, "cells"))
-        live(Progress("study", 1, 60, "cells"))  # begins anew before its end
+        live(Progress("study", 1, 60, "cells"))  # starts again before its end
         bars.refresh()
     assert [(t.description, t.completed) for t in bars.tasks] == [("study", 1)]
     assert (
@@ -209,7 +209,7 @@ def test_finished_bars_become_lines_so_that_the_one_at_work_is_seen():
 
 
 def test_a_bar_without_an_end_is_there_while_no_stage_is_at_work() -> None:
-    """While a model is loaded, between two stages, and not on the terminal that is left behind."""
+    """While a model is loaded, between two stages; not on the terminal after the end."""
     stage = TextColumn("{task.description}")
     with Bars(stage, console=Console(file=io.StringIO(), force_terminal=True, width=80)) as bars:
         live = Live(bars, Column(), Clock())
@@ -378,7 +378,7 @@ def test_the_probe_table_lists_families_and_layers():
     assert ["0", "1.5"] in cells
     assert ["accuracy", "50.0", "%"] in cells
     assert ["interval", "45.0", "to", "55.0", "%"] in cells
-    assert not any(line[:1] == ["drop"] for line in cells)  # of a probe without a baseline
+    assert not any(line[:1] == ["drop"] for line in cells)  # for a probe without a baseline
     compared = SimpleNamespace(layer=0, w2=1.5, baseline_w2=0.5)
     said = text_of(probe(dataclasses.replace(report, layers=(compared,))))
     assert ["0", "1.5", "0.5"] in [line.split() for line in said.splitlines()]
@@ -648,7 +648,7 @@ def test_a_merge_all_the_way_back_keeps_none_of_the_displacement(
 
 
 def test_the_probe_of_a_merge_asks_what_the_sweep_has_asked() -> None:
-    """Without its set the command asks a Hugging Face model about scenes that we have drawn."""
+    """Without its set the command would ask a Hugging Face model about our drawn scenes."""
     point = MergePoint(0.4, 0.6, 0.9, 0.5, (-1.0, 2.0))
     asked: list[tuple[str | None, str | None, str]] = [
         ("my set.jsonl", "{} Be brief.", " --vqa 'my set.jsonl' --ask '{} Be brief.'"),

@@ -1,4 +1,4 @@
-"""`aegis report`: a page that needs nothing else, whose figures are those of `--json`."""
+"""`aegis report`: a self-contained page, with the figures of `--json`."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def at(document: Any, pointer: str) -> Any:
 
 
 def check_figures(page: Page, document: Any) -> None:
-    """Every figure of the page is the document's, rounded."""
+    """Every figure of the page equals the document's, rounded."""
     assert len(page.figures) > 10
     for path, value, shown in page.figures:
         exact = at(document, path)
@@ -77,7 +77,7 @@ def check_figures(page: Page, document: Any) -> None:
 
 
 def reported(aegis: Any, folder: Path) -> tuple[Page, Any]:
-    """The page of a folder, and what `--json` printed when it was written."""
+    """The page of a folder, and the output of `--json` when it was written."""
     code, out, err = aegis("report", folder, "--json")
     assert code == 0 and f"report: {folder / 'report.html'}" in err
     return Page((folder / "report.html").read_text(encoding="utf-8")), json.loads(out)
@@ -104,7 +104,7 @@ def test_figures_of_a_job_are_those_of_json(aegis, job: Path) -> None:
 
 def test_the_page_tells_what_an_automatic_precision_was(aegis, job: Path) -> None:
     path = job / "naive" / "machine.json"
-    assert "Precisionauto" in reported(aegis, job / "naive")[0].said  # an earlier Aegis did not say
+    assert "Precisionauto" in reported(aegis, job / "naive")[0].said  # an earlier Aegis lacked it
     files.save_json(path, files.load_json(path) | {"precision": "float32"})
     assert "Precisionfloat32 (auto)" in reported(aegis, job / "naive")[0].said
 
@@ -297,7 +297,7 @@ def test_texts_of_artifacts_are_no_markup(aegis, tmp_path: Path) -> None:
 
 
 def test_a_folder_whose_name_is_not_utf8_has_a_page(aegis, tmp_path: Path) -> None:
-    """Python has such a byte as half of a surrogate pair, which UTF-8 cannot write."""
+    """Python represents such a byte as half of a surrogate pair, which UTF-8 cannot encode."""
     folder = tmp_path / os.fsdecode(b"caf\xe9")
     folder.mkdir()
     files.save_json(folder / "table.json", found(("naive", "x")).to_json())
@@ -326,7 +326,7 @@ def test_a_page_elsewhere_links_the_film_where_it_lies(aegis, job: Path, tmp_pat
 
 
 def test_what_only_a_later_probe_has_is_on_the_page(aegis, job: Path) -> None:
-    """The first one was measured without an anchor, and of other questions."""
+    """The first probe was measured without an anchor, and on other questions."""
     run = job / "naive"
     (run / "probe.json").unlink()
     less = probe("shape") | {"layers": [], "wrong": []}
@@ -418,7 +418,7 @@ def test_an_unfinished_run_has_a_page_without_what_is_not_measured(aegis, job: P
 
 
 def test_a_run_without_a_line_of_metrics_has_no_heading_for_them(aegis, job: Path) -> None:
-    """Such as one that was interrupted before its first line."""
+    """For example a run that was interrupted before its first line."""
     run, heading = job / "naive", "<h2>Learning</h2>"
     reported(aegis, run)
     assert heading in (run / "report.html").read_text(encoding="utf-8")
@@ -437,7 +437,7 @@ def test_questions_of_one_family_have_one_row(aegis, job: Path) -> None:
 
 
 def test_families_stand_side_by_side_only_where_the_same_was_asked(aegis, job: Path) -> None:
-    """The second probe of one run is of other questions than the second one of another."""
+    """The second probe of one run has other questions than the second one of another."""
     for method, vqa, family in (("naive", "scenes", "color"), ("aegis", "easy-vqa", "shape")):
         found = {**probe(family), "questions": 14}
         results.keep(job / method, f"probe-{vqa}", found, {"vqa": vqa})
@@ -485,7 +485,7 @@ def test_the_farther_ends_of_both_intervals_are_shown(aegis, tmp_path: Path) -> 
 def test_each_demand_of_the_bar_shows_the_interval_that_it_is_judged_by(
     aegis, tmp_path: Path
 ) -> None:
-    """A mean alone, beside a verdict on its interval's end, can seem to contradict it."""
+    """A mean alone, beside a verdict on its interval's end, may seem to contradict it."""
     written = found(("naive", "x"), 5).to_json()
     files.save_json(tmp_path / "table.json", written)
     page, document = reported(aegis, tmp_path)
@@ -501,7 +501,7 @@ def test_each_demand_of_the_bar_shows_the_interval_that_it_is_judged_by(
 
 
 def test_a_step_time_is_shown_in_the_digits_that_decide(aegis, tmp_path: Path) -> None:
-    """1.0204 fails a limit of 1.02, and `1.02`, failed, would contradict itself."""
+    """1.0204 fails a limit of 1.02, and a failed `1.02` would contradict itself."""
     study = found(("naive", "x"), 5)
     result = study.tasks[0].results[1]
     barred = bar(POLICY_BAR, replace(result, step_time=1.0204))
@@ -514,7 +514,7 @@ def test_a_step_time_is_shown_in_the_digits_that_decide(aegis, tmp_path: Path) -
 
 
 def test_page_and_table_say_what_of_the_bar_was_not_measured(aegis, tmp_path: Path) -> None:
-    """As success is not, of a robot that no simulator has."""
+    """For example success, for a robot without a simulator."""
     study = found(("naive", "x"), 5)
     result = replace(study.tasks[0].results[1], seen_gain_points=None)
     barred = bar(POLICY_BAR, result)
@@ -543,7 +543,7 @@ def test_a_study_of_what_is_not_rolled_out_has_its_frontier_and_its_bar(
     check_figures(page, document)
     assert "open-loop error on held-out episodes" in page.said and "not a success rate" in page.said
     place = "/tasks/0/results/1/bar/checks/1/interval/1"
-    # 0.02, failed by a limit of 0.02, would contradict itself.
+    # A 0.02 that fails a limit of 0.02 would contradict itself.
     assert [text for path, _, text in page.figures if path.endswith(place)] == ["0.0204"]
 
 
@@ -583,7 +583,7 @@ def test_chromium_opens_it_without_errors_or_requests(aegis, job: Path, tmp_path
     assert done.returncode == 0
     assert "CONSOLE" not in done.stderr
     check_figures(Page(done.stdout), document)
-    # The browser asks its maker for things of its own; none of them is on the page's behalf.
+    # The browser sends requests of its own to its vendor; none of them comes from the page.
     asked = re.findall(r'"url":"([^"]+)"', log.read_text())
     own = [url for url in asked if not url.startswith(("file:", "data:", "chrome", "devtools"))]
     assert [url for url in own if not re.match(r"https?://[\w.-]*\.?(google|gvt)", url)] == []

@@ -1,4 +1,4 @@
-"""`aegis train RUN`: a run goes on by what its own folder says, wherever it is called from."""
+"""`aegis train RUN`: a run resumes by what its own folder says, wherever it is called from."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def cut(
     steps: int = 2,
     sets: tuple[str, ...] = ("demos.safetensors",),
 ) -> Path:
-    """A run of the folder's recipe that was ended after so many steps of its three."""
+    """A run of the folder's recipe that ended after this many of its three steps."""
     resolved = recipes.load(place / "small.yaml", ["train.steps=3"])
     anchor = None if method == "naive" else Path("anchor.safetensors")
     with pytest.raises(KeyboardInterrupt):
@@ -160,7 +160,7 @@ def test_what_has_moved_is_named_and_taken_from_where_it_lies_now(
 
 
 def test_what_has_moved_together_with_its_run_is_found(place: Path, aegis: Aegis) -> None:
-    """As a job of `aegis run` is moved, or a project with its data."""
+    """For example if a job of `aegis run` is moved, or a project with its data."""
     cut(place)
     moved = place / "moved"
     moved.mkdir()
@@ -345,7 +345,7 @@ def test_a_run_that_is_not_there_is_missed_before_its_out(place: Path, bad: Bad)
 
 
 def test_demonstrations_are_asked_for_of_a_policy_alone(place: Path, bad: Bad) -> None:
-    """Who mistypes a run has to look for the run, and not for its demonstrations."""
+    """A user who mistypes a run has to look for the run, not for its demonstrations."""
     bad("evaluate", "./mistyped", says=("no checkpoint in 'mistyped'",))
     (place / "stream").mkdir()
     (place / "stream" / "recipe.yaml").write_text("kind: stream\nname: s\nstream: primer-1\n")

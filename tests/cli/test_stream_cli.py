@@ -201,7 +201,7 @@ def test_a_damaged_line_of_the_log_is_one_error(
         (*TRAIN, "--set", "train.steps=4", "--resume"),
     ):
         bad(*command, says=("metrics.jsonl is damaged: line 1", "delete the damaged line"))
-    log.write_bytes(whole + line)  # what was being written when the run stopped
+    log.write_bytes(whole + line)  # the line being written when the run stopped
     done(aegis, "inspect", "run")
     log.unlink()
     bad("inspect", "run", says=("no file 'run/metrics.jsonl'",))

@@ -1,4 +1,4 @@
-"""Question sets of files through the commands: anchors, probes with predictions, and recipes."""
+"""Question sets in files, through the commands: anchors, probes with predictions, recipes."""
 
 from __future__ import annotations
 
@@ -209,9 +209,9 @@ def made(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
 def test_a_recipe_with_sets_of_its_own(
     lines: Path, tiny_folder: Path, tmp_path: Path, made: Counter[str]
 ) -> None:
-    """In `aegis run` the anchor and the probe share a file and no image.
+    """In `aegis run` the anchor and the probe share a file but no image.
 
-    What has changed is measured again.
+    Whatever has changed is measured again.
     """
     place = tmp_path / "place"
     shutil.copytree(lines.parent, place)
@@ -238,9 +238,9 @@ def test_a_recipe_with_sets_of_its_own(
         "train": 1,
         "ask": 2,
         "rollout": 1,
-    }  # all that names the set's content
+    }  # everything that identifies the set's content
     made.clear()
-    (place / "images" / "0.png").touch()  # its time tells nothing
+    (place / "images" / "0.png").touch()  # its time does not matter
     pipeline.run(small, tmp_path / "runs")
     assert not made
     shutil.copy(place / "images" / "1.png", place / "images" / "0.png")

@@ -1,4 +1,4 @@
-"""Tables on terminals of any width: nothing is lost, nothing is broken, nothing is too wide."""
+"""Tables on terminals of any width: nothing is lost, broken or too wide."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def lines_of(
 
 
 def generated(seed: int) -> tuple[list[str], list[list[str]], int]:
-    """Header, rows, and how many columns name a line; the first of them is a word of its own."""
+    """Header, rows, and how many columns identify a line; the first of them is a single word."""
     draw = random.Random(seed)
     count, left = draw.randint(2, 14), draw.randint(1, 2)
     text = lambda: " ".join(draw.choices(WORDS, k=draw.randint(1, 3)))  # noqa: E731
@@ -54,7 +54,7 @@ def test_no_word_of_a_table_is_lost_broken_or_out_of_sight(seed: int, width: int
     cells = [word for row in rows for cell in row for word in cell.split()]
     for word in set(cells):
         assert shown.count(word) >= cells.count(word)
-    assert all(shown.count(row[0]) == parts for row in rows)  # each part names its lines
+    assert all(shown.count(row[0]) == parts for row in rows)  # each part identifies its lines
     letters = "".join(word for line in lines for word in line.split() if set(word) != {"─"})
     once = [cell for line in (header, *rows) for cell in line[left:]]
     in_each_part = [cell for line in (header, *rows) for cell in line[:left]]

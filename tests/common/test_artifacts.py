@@ -1,4 +1,4 @@
-"""Artifacts: what is saved is loaded, equal inputs give equal bytes, old files are migrated."""
+"""Artifacts: saved data loads again, equal inputs give equal bytes, old files are migrated."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def test_what_is_saved_is_loaded(tmp_path: Path, kind: str) -> None:
 
 
 def test_golden_bytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A change of these bytes makes every cached result stale: it needs a new schema."""
+    """If these bytes change, every cached result is stale: this needs a new schema."""
     monkeypatch.setattr(artifacts, "__version__", "0.0.0")
     tensors = {"b": torch.tensor([1, 2], dtype=torch.uint8), "a": torch.tensor([[1.0, -2.0]])}
     path = write(
@@ -83,7 +83,7 @@ def test_golden_bytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("kind", SAMPLES)
 def test_no_flipped_bit_is_loaded(tmp_path: Path, kind: str) -> None:
-    """Anywhere in the file: it is refused, or where nobody reads it the content is the same."""
+    """Anywhere in the file: it is refused, or the bit is never read and the content is the same."""
     path = write(tmp_path, kind)
     whole, kept = path.read_bytes(), artifacts.load(path)
     kept_tensors = {name: t.clone() for name, t in kept.tensors.items()}
@@ -145,7 +145,7 @@ def test_shared_memory_and_gradients_are_no_obstacle(tmp_path: Path) -> None:
 def test_a_gpus_tensors_come_to_the_cpu_one_at_a_time(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Here the CPU is told to copy, as it would from a GPU."""
+    """Here the CPU is made to copy, as it would from a GPU."""
     there: weakref.WeakSet[Tensor] = weakref.WeakSet()
     most = 0
 

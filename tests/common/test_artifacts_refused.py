@@ -46,7 +46,7 @@ def test_missing_file_and_folder(tmp_path: Path) -> None:
 def test_a_file_that_is_cut_after_its_header_was_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As torch says it of the mapping; other errors of a reader pass."""
+    """With torch's own text about the mapping; other errors of a reader pass."""
     path = write(tmp_path, "demos")
     said = f"file <{path}> size <4096> is smaller than the required mapping size <617656>"
 
@@ -375,7 +375,7 @@ def test_wrong_content_is_neither_written_nor_loaded(
         write(tmp_path, kind, tensors=altered(kind, name, value))
     assert words in caught.value.found and "nothing was written" in caught.value.fix
     assert not list(tmp_path.iterdir())
-    with monkeypatch.context() as patch:  # a careless program writes it all the same
+    with monkeypatch.context() as patch:  # a careless program writes it nevertheless
         patch.setattr(artifacts, "_validate", lambda *_: None)
         path = write(tmp_path, kind, tensors=altered(kind, name, value))
     refused(path, words, artifacts.KINDS[kind].command, kind=kind)
@@ -498,7 +498,7 @@ def test_missing_output_folder(tmp_path: Path) -> None:
 
 
 def test_read_only_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    # simulated: for root, who runs many a container, permission bits forbid nothing
+    # simulated, since for root, as in many containers, permission bits forbid nothing
     monkeypatch.setattr(
         "builtins.open", failing(PermissionError(errno.EACCES, "Permission denied"))
     )

@@ -1,4 +1,4 @@
-"""Which device is taken: the one that was chosen, in this process and those it starts."""
+"""Which device is used: the chosen one, in this process and in those it starts."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ Aegis = Callable[..., tuple[int, str, str]]
 
 @pytest.fixture(autouse=True)
 def none_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No device, unlike in other tests, which are all on the CPU."""
+    """No device, unlike in other tests, which all use the CPU."""
     monkeypatch.delenv(devices.VARIABLE, raising=False)
 
 
 @pytest.fixture
 def two_gpus(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """What torch says on a machine with two; the list has what was made the current one."""
+    """What torch reports on a machine with two; the list receives each device made current."""
     current: list[int] = []
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
@@ -40,7 +40,7 @@ def test_a_gpu_is_taken_if_there_is_one_and_none_was_chosen(two_gpus: list[int])
 
 
 def test_choosing_one_warns_of_nothing() -> None:
-    torch.set_warn_always(True)  # else PyTorch warns once in a process
+    torch.set_warn_always(True)  # otherwise PyTorch warns once per process
     try:
         devices.pick()
     finally:

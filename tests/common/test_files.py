@@ -1,4 +1,4 @@
-"""JSON files and digests: canonical, atomic, and clear about what cannot be read."""
+"""JSON files and digests: canonical, atomic, and with clear errors for unreadable files."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def test_json_round_trip_is_canonical(tmp_path: Path) -> None:
 
 def test_json_lines_are_plain_text_and_each_is_one_line(tmp_path: Path) -> None:
     path = tmp_path / "said.jsonl"
-    odd = "\x85 \u2028 \u2029 \x1c \n \ud83d end"  # ends of lines, and half of a pair
+    odd = "\x85 \u2028 \u2029 \x1c \n \ud83d end"  # line ends, and half of a pair
     files.save_json_lines(path, [{"said": "größer: 苹果 😀"}, {"said": odd}])
     text = path.read_text(encoding="utf-8")
     assert "größer: 苹果 😀" in text
@@ -96,7 +96,7 @@ files.write_atomically(Path(sys.argv[1]), write)
 
 @pytest.mark.parametrize("name", ["out [1].json", "é" * 127 + "x"])
 def test_what_a_killed_process_left_is_removed_by_the_next(name: str, tmp_path: Path) -> None:
-    """Of a name too that is as long as a file system takes, 255 bytes."""
+    """This includes a name of the file system's maximum length, 255 bytes."""
     path = tmp_path / name
     command = [sys.executable, "-c", WRITE_AND_DIE, str(path), "SIGKILL"]
     assert subprocess.run(command, check=False).returncode == -signal.SIGKILL
@@ -112,7 +112,7 @@ def test_what_another_process_is_writing_stays(tmp_path: Path) -> None:
     command = [sys.executable, "-c", WRITE_AND_DIE, str(path), "SIGSTOP"]
     other = subprocess.Popen(command)
     try:
-        # A signal that comes before it has stopped itself would not wake it.
+        # A signal that arrives before it has stopped itself would not wake it.
         _, status = os.waitpid(other.pid, os.WUNTRACED)
         assert os.WIFSTOPPED(status)
         files.save_json(path, 1)
@@ -157,7 +157,7 @@ def test_a_folder_that_another_process_fills_stays(tmp_path: Path) -> None:
         try:
             assert other.stdout is not None
             theirs = Path(other.stdout.readline().strip())
-            os.waitpid(other.pid, os.WUNTRACED)  # until it has stopped, or going on comes too soon
+            os.waitpid(other.pid, os.WUNTRACED)  # until it has stopped, or SIGCONT comes too early
             with files.folder_aside(path) as aside:
                 assert {*tmp_path.iterdir()} == {theirs, aside}
             other.send_signal(signal.SIGCONT)
@@ -206,7 +206,7 @@ def test_a_folder_is_renamed_once_all_of_it_is_on_the_disk(
 def test_what_is_swept_before_it_is_locked_is_made_again(
     removed: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Another process looks for leftovers in the moment between making and locking."""
+    """Another process looks for leftovers between the creation and the lock."""
     lock, seen = fcntl.flock, list[Path]()
 
     def flock(number: int, operation: int) -> None:
@@ -224,7 +224,7 @@ def test_what_is_swept_before_it_is_locked_is_made_again(
 
 
 def test_a_full_disk_is_named_by_a_folder_that_stays(tmp_path: Path) -> None:
-    """What is written aside is gone when the user reads it."""
+    """The temporary file is gone by the time the user reads the error."""
     with files.folder_aside(tmp_path / "runs") as aside:
         (aside / "backbone").mkdir()
         with disk(10), pytest.raises(AegisError) as caught:
@@ -235,7 +235,7 @@ def test_a_full_disk_is_named_by_a_folder_that_stays(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["runs", "runs/x"])
 def test_a_folder_behind_a_link_that_leads_nowhere_is_not_made(name: str, tmp_path: Path) -> None:
-    """As where the disk that it leads to is not mounted."""
+    """For example if the target disk is not mounted."""
     (tmp_path / "runs").symlink_to("disk/runs")
     with pytest.raises(AegisError) as caught:
         files.make_folder(tmp_path / name)
@@ -271,7 +271,7 @@ SPECIAL = {"a device": make_device, "a pipe": os.mkfifo, "a socket": make_socket
 @pytest.mark.parametrize("linked", [False, True])
 @pytest.mark.parametrize("kind", SPECIAL)
 def test_an_output_replaces_no_device_and_no_pipe(kind: str, linked: bool, tmp_path: Path) -> None:
-    """A rename onto /dev/null would take it from every program of the machine."""
+    """Renaming a file onto /dev/null would remove it for every program on the machine."""
     special = path = tmp_path / "special"
     SPECIAL[kind](special)
     if linked:
@@ -290,7 +290,7 @@ def test_an_output_replaces_no_device_and_no_pipe(kind: str, linked: bool, tmp_p
 
 @pytest.mark.parametrize("kind", SPECIAL)
 def test_an_input_that_is_no_file_is_refused_before_it_is_opened(kind: str, tmp_path: Path) -> None:
-    """Whoever opens a pipe that nobody writes to waits without an end."""
+    """Opening a pipe without a writer would wait forever."""
     path = tmp_path / "special"
     SPECIAL[kind](path)
     for read in (files.load_json, files.sha256_file):

@@ -1,4 +1,4 @@
-"""What is imported takes no part in collections of garbage."""
+"""Imported objects take no part in garbage collections."""
 
 from __future__ import annotations
 
@@ -49,5 +49,5 @@ def test_a_stage_is_imported_so_once(monkeypatch: pytest.MonkeyPatch) -> None:
         importlib, "import_module", lambda name: found.append((name, gc.isenabled()))
     )
     assert Stage("no_stage", render.facts).module is None
-    assert Stage("cli.stages", render.facts).module.Stage is Stage  # it is there already
+    assert Stage("cli.stages", render.facts).module.Stage is Stage  # it is already imported
     assert found == [("aegis_cli.no_stage", False)]

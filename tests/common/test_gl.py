@@ -1,4 +1,4 @@
-"""The OpenGL backend: the user's choice, else what is here, else what to install."""
+"""The OpenGL backend: the user's choice, else what is installed, else what to install."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from aegis_cli.common.errors import AegisError
 
 @pytest.fixture
 def machine(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
-    """A Linux machine that has some libraries and a user who set MUJOCO_GL, or not."""
+    """A Linux machine with some libraries, whose user has set MUJOCO_GL or not."""
 
     def pretend(*libraries: str, setting: str | None = None, platform: str = "linux") -> None:
         monkeypatch.setattr(
@@ -74,7 +74,7 @@ def test_a_chosen_library_that_is_missing_is_named_with_its_package(
 ) -> None:
     machine(
         *{"EGL", "OSMesa", "glfw"} - {gl._LIBRARY[setting][0]}, setting=setting
-    )  # what else is there does not count
+    )  # what else is installed does not matter
     with pytest.raises(AegisError, match=f"MUJOCO_GL={setting}") as caught:
         gl.choose_backend()
     assert f"apt-get install {package}" in caught.value.fix
@@ -147,7 +147,7 @@ def test_the_command_says_so_before_any_work(
 
 
 def test_triton_comes_before_the_renderer(tmp_path: Path) -> None:
-    """Where Mesa's LLVM is at work, the import of triton's ends the process."""
+    """If Mesa's LLVM is already in use, importing triton's ends the process."""
     (tmp_path / "triton.py").write_text("import sys; print('mujoco' in sys.modules)")
     done = subprocess.run(
         [sys.executable, "-c", "import aegis_cli.sim.scene"],

@@ -24,7 +24,7 @@ ENDING = [signal.SIGTERM, signal.SIGHUP]
 
 @pytest.fixture(autouse=True)
 def handlers() -> Iterator[None]:
-    """Handlers as a fresh process has them, and afterwards those of the test's process."""
+    """Handlers as in a fresh process, and afterwards those of the test's process."""
     numbers = (signal.SIGINT, *ENDING)
     before = [signal.getsignal(number) for number in numbers]
     signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -49,12 +49,12 @@ def test_a_signal_from_outside_is_an_interruption(number: int) -> None:
 
 @pytest.mark.parametrize("number", [signal.SIGINT, *ENDING])
 def test_a_process_that_waits_for_others_ends_at_once(number: int) -> None:
-    """A handler of Python's would run only once the others have come."""
+    """A Python handler would run only once the others have arrived."""
     with listening():
         with ending_at_once():
             assert signal.getsignal(number) is signal.SIG_DFL
         assert signal.getsignal(number) is interrupts.stop
-    with ending_at_once():  # what nobody listens to stays
+    with ending_at_once():  # signals that nothing handles stay as they are
         expected = signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL
         assert signal.getsignal(number) is expected
 
@@ -102,7 +102,7 @@ def test_ctrl_c_before_anybody_listens_has_its_own_code_and_then_is_an_interrupt
 
 
 def test_what_is_ignored_or_handled_stays_so() -> None:
-    """SIGHUP is ignored under nohup, which is there for that."""
+    """nohup ignores SIGHUP, which is its purpose."""
     seen: list[int] = []
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, lambda number, _: seen.append(number))
@@ -193,7 +193,7 @@ def test_somebody_elses_listener_for_signals_is_kept() -> None:
 
 
 def test_in_other_threads_nothing_changes() -> None:
-    """Handlers can be set in the main thread alone."""
+    """Handlers can only be set in the main thread."""
     problems: list[BaseException] = []
 
     def work(call: Callable[[], object]) -> None:

@@ -1,4 +1,4 @@
-"""Digests of large files are kept, and taken anew where somebody has written to a file."""
+"""Digests of large files are cached, and computed again if a file was written to."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ Forget = Callable[[], None]
 
 @pytest.fixture
 def forget(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Forget:
-    """What a new process knows, which is what the cache has; files of any size are large."""
+    """Forget what only a running process knows, leaving the cache; files of any size are large."""
     monkeypatch.setenv("AEGIS_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr(kept_digests, "LARGE", 1)
-    # The change of a file's node cannot be set back, as the time of its content can.
+    # The change time of an inode cannot be set back, unlike that of its content.
     monkeypatch.setattr(kept_digests, "_SETTLED_S", -1.0)
 
     def forget() -> None:
@@ -81,7 +81,7 @@ def test_another_process_reads_nothing_again(
 def test_a_file_that_was_written_to_is_read_again(
     how: str, forget: Forget, reads: list[str], tmp_path: Path
 ) -> None:
-    """Also one of the same size whose time was set back, as an archive's tool does."""
+    """This includes a file of equal size whose time was set back, as archive tools do."""
     paths = written(tmp_path / "set")
     kept_digests.of_files(paths, tmp_path / "set")
     del reads[:]
@@ -101,7 +101,7 @@ def test_a_file_that_was_written_to_is_read_again(
         forget()
         found = kept_digests.of_files(paths, tmp_path / "set")
         assert found == {path: digest(path) for path in paths}
-    assert reads == [changed.name]  # once: what was found of the new content is kept
+    assert reads == [changed.name]  # once: the new content's digest is cached
 
 
 def test_what_was_written_just_now_is_not_kept(
@@ -193,12 +193,12 @@ def test_progress_ends_with_all_of_it(
 def test_of_two_that_begin_at_once_one_reads(
     forget: Forget, reads: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The other waits for the first's lock, and then knows what that has kept."""
+    """The other waits for the first one's lock, and then uses its cached digest."""
     paths = written(tmp_path / "set")
     expected = {path: digest(path) for path in paths}
     found: list[dict[Path, str]] = []
     with monkeypatch.context() as patch:
-        # Each as if it were a process that knows nothing.
+        # Each acts like a process without a cache of its own.
         patch.setattr(kept_digests, "_known", _Forgetful())
         both = [
             threading.Thread(
@@ -228,7 +228,7 @@ def test_who_waits_for_another_process_is_told(
         assert isinstance(event, Progress)
         told.append((event.stage, event.done))
         if event.done == 0:
-            os.close(other)  # the other process has read all
+            os.close(other)  # the other process has read everything
 
     kept_digests.of_files(paths, tmp_path / "set", heard)
     waits = "checksums (waits for another process that reads the data set)"
@@ -236,7 +236,7 @@ def test_who_waits_for_another_process_is_told(
 
 
 class _Forgetful(dict):
-    """Knows within a thread only what that has learned."""
+    """Knows within a thread only what that thread has learned."""
 
     def __init__(self) -> None:
         super().__init__()

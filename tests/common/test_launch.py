@@ -1,4 +1,4 @@
-"""What a launcher has to say for several processes to meet."""
+"""What a launcher has to set so that several processes can connect."""
 
 from __future__ import annotations
 

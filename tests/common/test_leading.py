@@ -1,4 +1,4 @@
-"""One process leads a job; the others take part in what it shares, and learn how it ended."""
+"""One process leads a job; the others do their share of it, and learn how it ended."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ TESTS = Path(__file__).parent.parent
 
 @contextmanager
 def another(folder: Path) -> Iterator[subprocess.Popen[str]]:
-    """Another process that holds the folder."""
+    """Another process that holds the folder's lock."""
     process = subprocess.Popen(
         [sys.executable, "-m", "samples.workers", "hold", str(folder)],
         stdout=subprocess.PIPE,
@@ -65,7 +65,7 @@ def test_a_dead_process_holds_nothing(tmp_path: Path, number: int) -> None:
 
 
 def test_the_same_process_is_refused_too(tmp_path: Path) -> None:
-    """As a program that trains twice at once, in two threads."""
+    """For example a program that trains twice at once, in two threads."""
     with locks.alone(tmp_path):
         assert f"process {os.getpid()} on" in refused(tmp_path)
     with locks.alone(tmp_path):
@@ -88,7 +88,7 @@ def test_a_folder_that_stays_empty_is_gone_again(tmp_path: Path) -> None:
 def test_a_folder_above_that_another_removes_meanwhile_is_made_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As of two cells of a study: one that ends removes what the other has just begun to use."""
+    """For example two cells of a study: one that ends removes a folder that the other needs."""
     folder, plain = tmp_path / "reach" / "naive" / "0", os.mkdir
     removed: list[Path] = []
 
@@ -123,7 +123,7 @@ def test_a_file_is_no_folder(tmp_path: Path) -> None:
 def test_where_folders_cannot_be_locked_a_file_beside_them_is(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As on NFS. The file is gone with the lock."""
+    """As on NFS. The file is removed with the lock."""
     real = fcntl.flock
 
     def flock(descriptor: int, how: int) -> None:

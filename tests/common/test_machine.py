@@ -1,4 +1,4 @@
-"""The name of a machine tells apart what its times are not comparable with."""
+"""The name of a machine distinguishes machines whose times are not comparable."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Contact sheets and videos: where each picture lies, and what is drawn on it."""
+"""Contact sheets and videos: the place of each picture, and what is drawn on it."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def noise(seed: int, height: int = 64, width: int = 64) -> np.ndarray:
 
 
 def moments(count: int, outcome: bool | None = None) -> list[Moment]:
-    """Open until the last, which has the outcome."""
+    """Open until the last one, which has the outcome."""
     open_ = [Moment(GREY, f"step {i}") for i in range(count - 1)]
     return [*open_, Moment(GREY, f"step {count - 1}", outcome)]
 
@@ -39,7 +39,7 @@ def tile(picture: np.ndarray, i: int = 0, columns: int = 1) -> np.ndarray:
 
 
 def border(picture: np.ndarray) -> set[tuple[int, ...]]:
-    """The colours of a tile's edges, away from the corner that the note is in."""
+    """The colours of a tile's edges, away from the corner with the note."""
     edges = (picture[-1], picture[-media._BORDER], picture[:, -1], picture[TILE // 2 :, 0])
     return {tuple(pixel) for edge in edges for pixel in edge.tolist()}
 
@@ -84,7 +84,7 @@ def test_letters_beyond_ascii_are_drawn_in_captions_and_notes() -> None:
 
 
 def test_all_captions_of_a_sheet_are_set_in_one_font() -> None:
-    """A letter beyond ASCII in one caption decides the font of the others, too."""
+    """A character beyond ASCII in one caption determines the font of the others too."""
     ascii_alone, mixed, wide = (
         np.asarray(media.tiled([(text, [GREY]), (other, [GREY])], 2, tile=64, text=10))
         for text, other in (("pick", "place"), ("pick", "für"), ("pick", "ß"))
@@ -111,7 +111,7 @@ def test_the_border_says_how_it_ended_once_that_is_known(
 
 
 def test_success_failure_and_neither_differ_in_brightness_too() -> None:
-    """They must be told apart by who does not see red and green."""
+    """A viewer who cannot tell red from green must be able to distinguish them."""
     shades = sorted(
         float(np.dot(color, (0.2126, 0.7152, 0.0722)))
         for color in (media.FAILURE, media.SUCCESS, media.UNDECIDED)
@@ -136,7 +136,7 @@ def test_the_ring_is_around_the_target_and_leaves_it_as_it_is() -> None:
     away = np.hypot(columns + 0.5 - edge - 0.5 * side, rows + 0.5 - edge - 0.75 * side)
     assert 0.1 * side < away.min() and away.max() < 0.1 * side + 20
     angles = np.arctan2(rows - edge - 0.75 * side, columns - edge - 0.5 * side)
-    assert len(np.unique(angles.round(1))) > 60  # the whole way round
+    assert len(np.unique(angles.round(1))) > 60  # all the way round
     assert ringed[rows, columns].max() == 255
 
 
@@ -197,9 +197,9 @@ def test_what_is_appended_begins_with_a_key_frame(every: int, tmp_path: Path) ->
     assert [float(frame.time) for frame in frames] == pytest.approx([i / 10 for i in range(11)])
 
 
-@pytest.mark.parametrize("frames", [1, 60])  # the encoder keeps some dozens back
+@pytest.mark.parametrize("frames", [1, 60])  # the encoder holds some dozens back
 def test_a_disk_without_room_for_a_videos_beginning_is_an_error(frames: int) -> None:
-    """FFmpeg would crash where somebody goes on after its first write has failed."""
+    """FFmpeg would crash if it continued after its first failed write."""
     code = f"""
 import errno
 import numpy

@@ -1,4 +1,4 @@
-"""What a process has taken at most, since it began or since it was asked to begin anew."""
+"""The peak memory of a process, since its start or since the peak was last reset."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ CPU = torch.device("cpu")
     not os.access("/proc/self/clear_refs", os.W_OK), reason="needs a peak that can begin anew"
 )
 def test_a_peak_begins_anew() -> None:
-    # In a process of its own: in this one, what earlier tests left may be given back meanwhile.
+    # In a process of its own, since memory of earlier tests may be freed meanwhile in this one.
     size, before, base, after = processes.alone(peaks)
     assert base < before - size / 2
     assert size / 4 < after - base < size
@@ -42,7 +42,7 @@ def test_what_is_free_is_known_on_linux_alone(monkeypatch: pytest.MonkeyPatch) -
     not hasattr(ctypes.CDLL(None), "mallinfo2"), reason="needs glibc 2.33, which tells what it maps"
 )
 def test_what_is_freed_goes_back_within_the_block_alone() -> None:
-    # In a process of its own: the setting is that of the whole process.
+    # In a process of its own, since the setting is global to the process.
     before, within, after = processes.alone(mapped_blocks)
     assert before == after == 0
     assert within >= 24_000_000
@@ -50,6 +50,6 @@ def test_what_is_freed_goes_back_within_the_block_alone() -> None:
 
 @pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "mallopt"), reason="needs glibc")
 def test_what_is_freed_after_the_block_is_kept_again() -> None:
-    """Else whatever computes next would fetch the same pages from the system again and again."""
+    """Otherwise later computations would request the same pages from the system repeatedly."""
     faults, pages = processes.alone(faults_after_returned)
     assert faults < pages / 10

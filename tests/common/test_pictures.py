@@ -1,4 +1,4 @@
-"""Pixels out of image files: upright, of every common kind, or refused."""
+"""Pixels from image files: upright, for every common format, or refused."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from aegis_cli.data.lerobot import pictures
 from aegis_cli.data.streams import folders
 from aegis_cli.data.vqa import images
 
-TURN = 0x0112  # EXIF: how to turn the picture
+TURN = 0x0112  # EXIF: how to rotate the picture
 Decode = Callable[[bytes], np.ndarray]
 
 
@@ -31,14 +31,14 @@ def stored(image: Image.Image, format: str = "PNG", **options: object) -> bytes:
 
 
 def turned() -> bytes:
-    """A picture to be shown turned by 90 degrees clockwise."""
+    """A picture to be shown rotated by 90 degrees clockwise."""
     exif = Image.Exif()
     exif[TURN] = 6
     return stored(picture(1), exif=exif)
 
 
 def huge() -> bytes:
-    """A small file that says it has 900 million pixels."""
+    """A small file that declares 900 million pixels."""
 
     def chunk(kind: bytes, content: bytes) -> bytes:
         return (
@@ -59,7 +59,7 @@ def huge() -> bytes:
 
 @pytest.fixture(params=["questions", "streams", "robots"])
 def decode(request: pytest.FixtureRequest, tmp_path: Path) -> Decode:
-    """What decodes a picture for each of them; for streams, cut to its middle square."""
+    """The decoder of a picture for each of them; for streams, cropped to its middle square."""
 
     def of_stream(data: bytes) -> np.ndarray:
         (tmp_path / "x.png").write_bytes(data)
@@ -83,7 +83,7 @@ def test_pictures_are_upright_wherever_they_are_read(decode: Decode) -> None:
 
 
 def clear(mode: str) -> Image.Image:
-    """A picture whose left half is transparent, with black below that; the rest is half so."""
+    """A picture whose left half is transparent with black below; the rest is semi-transparent."""
     image = picture(1).convert("L" if mode == "LA" else "RGB")
     alpha = Image.new("L", image.size, 100)
     for target, value in ((image, 0), (alpha, 0)):
@@ -96,7 +96,7 @@ def clear(mode: str) -> Image.Image:
     ("mode", "format"), [("RGBA", "PNG"), ("LA", "PNG"), ("P", "PNG"), ("RGBA", "WEBP")]
 )
 def test_what_is_transparent_lies_on_white(mode: str, format: str, decode: Decode) -> None:
-    """Whatever transformers' processors of the installed version would make of it."""
+    """Whatever the installed version of transformers' processors would do with it."""
     image = clear(mode)
     data = stored(image, format, **({"lossless": True} if format == "WEBP" else {}))
     pixels = decode(data)
@@ -124,7 +124,7 @@ SCRIPT = b"""%!PS-Adobe-3.0 EPSF-3.0
 def test_a_picture_that_is_a_program_is_never_run(
     data: bytes, decode: Decode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Whatever its name says, Pillow would have Ghostscript run the first."""
+    """Whatever its name, Pillow would have Ghostscript run the first one."""
     monkeypatch.setattr(subprocess, "check_call", lambda *_, **__: pytest.fail("it was run"))
     monkeypatch.setattr(subprocess, "Popen", lambda *_, **__: pytest.fail("it was run"))
     with pytest.raises(AegisError, match="not in a known raster format"):

@@ -1,4 +1,4 @@
-"""Work shared out among processes: in order, not far ahead, and with an end whatever happens."""
+"""Work shared among processes: in order, not far ahead, and always with an end."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_workers_wait_for_whoever_takes_the_results(tmp_path: Path) -> None:
     paths = [tmp_path / str(i) for i in range(60)]
     with mapped(Path.touch, paths, 2, "a touching process", "", chunk=2) as results:
         next(results)
-        time.sleep(0.3)  # none of the others takes a hundredth of it
+        time.sleep(0.3)  # none of the others takes a hundredth of that
         assert len(list(tmp_path.iterdir())) <= 2 * 2 * 2
         assert len(list(results)) == 59
     assert len(list(tmp_path.iterdir())) == 60
@@ -110,7 +110,7 @@ def test_workers_end_with_their_parent_and_clean_up(tmp_path: Path, number: int)
 
 
 def await_worker(file: Path) -> int:
-    """Number of the worker process that is at work, once it is."""
+    """The process id of the working worker, once there is one."""
     given_up = time.monotonic() + 120
     while not (file.exists() and file.read_text(encoding="utf-8")):
         assert time.monotonic() < given_up

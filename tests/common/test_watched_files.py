@@ -1,4 +1,4 @@
-"""Files that stay mapped: writing into one is noticed, replacing it is not our concern."""
+"""Memory-mapped files: writing into one is noticed; replacing it is harmless."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from aegis_cli.common.watched_files import WatchedFiles
 def overwrite(path: Path) -> None:
     with open(path, "r+b") as file:
         file.write(b"X")
-    os.utime(path, ns=(0, 12345))  # whatever the clock's steps are
+    os.utime(path, ns=(0, 12345))  # whatever the clock's resolution
 
 
 def cut(path: Path) -> None:
@@ -44,7 +44,7 @@ def touch(path: Path) -> None:
 
 
 def test_a_file_whose_time_alone_changes_is_the_same(tmp_path: Path) -> None:
-    """Its content is compared, and again when its time changes once more."""
+    """Its content is compared, and again if its time changes once more."""
     path = tmp_path / "a"
     path.write_bytes(b"data")
     watched = WatchedFiles([path])
@@ -68,7 +68,7 @@ def test_a_file_that_is_not_read_for_its_digest_is_watched_by_its_time(tmp_path:
 
 
 def test_a_file_that_is_replaced_or_removed(tmp_path: Path) -> None:
-    """What is mapped is the old file, which nobody changes any more."""
+    """The mapped data is the old file's, which no longer changes."""
     path, other = tmp_path / "a", tmp_path / "b"
     path.write_bytes(b"data")
     other.write_bytes(b"other data")

@@ -1,4 +1,4 @@
-"""What a new learner of streams takes: its file and its name, and nothing else in the package."""
+"""What a new learner of streams needs: its file and its name, and no other change."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_a_file_with_another_learners_name_is_an_error(
 
 
 def test_every_file_of_a_learner_is_known() -> None:
-    """None is forgotten in recipes."""
+    """The recipes list all of them."""
     files = Path(learners.__file__).parent.glob("*.py")
     found = {path.stem for path in files if "\nLEARNER = " in path.read_text(encoding="utf-8")}
     assert found == {name.replace("-", "_") for name in recipes.LEARNERS}

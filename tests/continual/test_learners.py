@@ -1,4 +1,4 @@
-"""What every learner of a stream keeps to, and what each of them is for."""
+"""The contract of every learner of a stream, and the purpose of each."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ WITH_EXPERTS = [name for name, learner in LEARNERS.items() if learner.trains == 
 FROZEN = [name for name in WITH_EXPERTS if LEARNERS[name].frozen]
 LIKE = torch.tensor(
     [[1.0, 0.0], [0.0, 1.0], [1.0, 0.1]]
-)  # prototypes: the third task looks like the first
+)  # prototypes: the third task resembles the first
 
 
 class Stream:
-    """A learner on its way through three tasks; training is a random change of what learns."""
+    """A learner taking three tasks; training is a random change of the trainable parameters."""
 
     def __init__(self, name: str, **options: object) -> None:
         sections = {
@@ -78,7 +78,7 @@ class Stream:
     def flows(self, task: int) -> dict[str, Flow]:
         router = self.learner.router(task)
         with torch.no_grad(), traced(self.sites) as found:
-            self.outputs(task)  # all of it is read
+            self.outputs(task)  # all of it is used
         return {n: flow(found[n], s.of(s.router(router).experts)) for n, s in self.sites.items()}
 
     def learn(self, task: int) -> None:
@@ -129,7 +129,7 @@ def test_what_learns_is_what_it_says(name: str) -> None:
             assert not learning
         elif stream.learner.trains == "model":
             assert learning == {n for n, _ in stream.model.named_parameters()}
-        else:  # the maps' own weights never learn, nor does what is frozen
+        else:  # the maps' own weights never learn, nor do frozen ones
             assert learning and all(".experts." in n or ".routers." in n for n in learning)
             frozen = {
                 f"{s}.experts.{n}."
@@ -193,7 +193,7 @@ def test_what_is_shared_and_goes_on_learning_moves_the_first_task(name: str) -> 
 
 @pytest.mark.parametrize("name", LEARNERS)
 def test_begun_twice_alike_it_is_alike(name: str) -> None:
-    """What is drawn is a function of the context's generator, whatever torch's own is doing."""
+    """Random draws depend only on the context's generator, not on torch's own."""
     streams = []
     for seed in (0, 99):
         torch.manual_seed(seed)
@@ -213,7 +213,7 @@ def test_an_unknown_learner() -> None:
 
 
 def flows_of(stream: Stream, new_mass: float, new_load: float) -> dict[str, Flow]:
-    """Flows with some mass and load on all new experts together, and the rest on the old ones."""
+    """Flows with a mass and load for all new experts together, and the rest on the old ones."""
     found = {}
     for name, site in stream.sites.items():
         used = site.routers["1"].experts
@@ -249,7 +249,7 @@ def test_igsp_prunes_by_weight_and_load(
         assert sum(site.experts[str(n)].owner == 1 for n in used) == stay
         assert (
             sum(e.owner == 1 for e in site.of(site.numbers)) == stay
-        )  # nothing that is gone is stored
+        )  # nothing that was removed is stored
         assert not [p for p in site.routers["1"].logit_parameters() if p.requires_grad]
         assert site.routers["1"].scale.requires_grad
         assert all(e.a.requires_grad for e in site.of(site.numbers) if e.owner == 1)
@@ -291,7 +291,7 @@ def test_igsp_starts_with_a_share_on_history_and_new_experts_at_full_strength(
 
 @pytest.mark.parametrize("reuse", [0.0, 0.3])
 def test_igsps_penalty_is_the_share_of_new_numbers_asked_for_and_their_norms(reuse: float) -> None:
-    """The loss reads the second image alone, where a map's mass is priced by its experts' size."""
+    """The loss reads only the second image, where a map's mass is weighted by its experts' size."""
     stream = Stream("igsp", reuse=reuse, norm=0.05)
     for task in range(2):
         context = stream.begin(task)
@@ -334,7 +334,7 @@ def _penalty_by_hand(stream: Stream, task: int, traces: Traces) -> Tensor:
 
 
 def test_igsps_orthogonal_phase_moves_off_historys_columns_only() -> None:
-    """The applied update, not the gradient alone: Adam would turn it back."""
+    """This is about the applied update, not only the gradient: Adam would rotate it back."""
     shares = {}
     for orthogonal in (False, True):
         stream = Stream("igsp", orthogonal=orthogonal, candidates=1, prune=False)
@@ -414,7 +414,7 @@ def test_moe_adapters_choose_by_image_and_for_all_texts_alike() -> None:
         weights = passes[0].weights  # [N, T, E]
         assert torch.equal(
             weights, weights[:, :1].expand_as(weights)
-        )  # all positions of a sequence alike
+        )  # all positions of a sequence have equal weights
         assert (weights > 0).sum(-1).eq(2).all()
         assert (len(weights[:, 0].unique(dim=0)) == 1) == stream.model.in_text(name)
 

@@ -1,7 +1,7 @@
-"""Runs of a stream that an earlier version wrote: today's code inspects, probes and resumes them.
+"""Runs of a stream by an earlier version: today's code inspects, probes and resumes them.
 
-The sample is what version 2e38d13 made of two tasks of small pictures with igsp: a finished run,
-and the same one interrupted between its tasks and in either phase of the second. Beside them lie
+The sample was made by version 2e38d13 from two tasks of small pictures with igsp: a finished run,
+and the same run interrupted between its tasks and in either phase of the second. Beside them are
 the images and the dual encoder, named by paths relative to the folder.
 """
 
@@ -27,14 +27,14 @@ INTERRUPTED = {"between-tasks": (0, 2), "in-phase-1": (4, 1), "in-phase-2": (8, 
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A copy of the sample, as the working folder."""
+    """A copy of the sample as the working folder."""
     copy = shutil.copytree(SAMPLE, tmp_path / "old")
     monkeypatch.chdir(copy)
     return copy
 
 
 def first_experts(run: Path) -> dict[str, torch.Tensor]:
-    """The experts that the first task brought."""
+    """The experts that were added by the first task."""
     saved = artifacts.load(run / files.EXPERTS, "experts")
     report = files.read(run)
     names = {
@@ -62,7 +62,7 @@ def test_a_finished_run_is_shown(folder: Path, aegis: Callable[..., tuple[int, s
 
 
 def matrix() -> dict[str, Any]:
-    """The finished run's accuracies; Python 3.12 adds numbers to more digits than 3.11 does."""
+    """The finished run's accuracies; Python 3.12 sums numbers to more digits than 3.11."""
     written = Path("finished/accuracy_matrix.json").read_text(encoding="utf-8")
     return json.loads(written, parse_float=lambda digits: round(float(digits), 12))
 
@@ -85,8 +85,8 @@ def test_a_finished_run_is_not_learned_again(folder: Path) -> None:
 def test_an_interrupted_run_goes_on(name: str, folder: Path) -> None:
     """What was learned before is kept bit for bit, and the rest is learned as it was then.
 
-    Equal bytes of what is still to be learned are promised on one processor only, so that here the
-    shapes of it are compared.
+    Equal bytes of the newly learned part are guaranteed only on one processor, so this test
+    compares its shapes.
     """
     place = artifacts.read_header(Path(name) / state.STATE).meta["place"]
     assert (place["task"], place["step"], place["phase"]) == (1, *INTERRUPTED[name])

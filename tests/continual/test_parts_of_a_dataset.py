@@ -51,7 +51,7 @@ ANY = cast(
 def libero(
     folder: Path, texts: Sequence[str], cameras: tuple[str, ...] = ("image",), **spec: Any
 ) -> Path:
-    """A dataset with the columns of LIBERO's, of one episode per text."""
+    """A dataset with LIBERO's columns, with one episode per text."""
     rng = np.random.default_rng(0)
     made = [
         dataclasses.replace(
@@ -66,7 +66,7 @@ def libero(
 
 
 def texts_of(*tasks: str, each: int = 2, seed: int = 0) -> list[str]:
-    """Instructions of tasks or suites, each so many times, in any order."""
+    """Instructions of tasks or suites, each this many times, in any order."""
     found = [text for task in tasks for text in table.instructions(task)] * each
     random.Random(seed).shuffle(found)
     return found
@@ -78,7 +78,7 @@ def stream(tasks: Sequence[str], paths: Path | Sequence[Path], **demos: Any) -> 
 
 
 def learned(recipe: RobotStreamRecipe, number: int) -> Demonstrations:
-    """The demonstrations of a task, as its training has them."""
+    """The demonstrations of a task as used in its training."""
     return robot_demos.load(recipe, number, ANY, Path("unused"), ignore)
 
 
@@ -107,7 +107,7 @@ def test_each_suite_takes_its_own_episodes_of_one_dataset(
 
 @pytest.mark.parametrize("seed", range(3))
 def test_so_do_single_tasks_one_after_the_other(seed: int, tmp_path: Path) -> None:
-    """Also where the set is listed for each, and where capitals differ."""
+    """This holds if the set is listed for each, and if capitalization differs."""
     texts = [f"{text.capitalize()} " for text in texts_of("libero/all", each=2, seed=seed)]
     tasks = sim.members("libero/goal")
     folder = libero(tmp_path / "d", texts)
@@ -136,7 +136,7 @@ def test_a_task_is_scaled_by_its_own_episodes(tmp_path: Path) -> None:
 def test_a_dataset_of_one_task_is_learned_as_it_was_before(
     texts: list[str], task: str, tmp_path: Path
 ) -> None:
-    """Also where the instructions are none of LIBERO's: they may be said in other words."""
+    """This holds even if the instructions are not LIBERO's: they may have other wordings."""
     folder = libero(tmp_path / "d", texts)
     recipe = stream([task], [folder])
     assert robot_demos.given(recipe, 0) == (folder, Selection())
@@ -164,7 +164,7 @@ def test_what_cannot_be_told_apart_is_refused_before_anything_is_decoded(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     for name in ("check", "check_recordable"):
-        monkeypatch.setattr(robots.sim, name, lambda task: None)  # which would want LIBERO
+        monkeypatch.setattr(robots.sim, name, lambda task: None)  # which would need LIBERO
     monkeypatch.setattr(robot_demos, "load", lambda *_: pytest.fail("a set was read"))
     demos = RobotDemos(paths=str(libero(tmp_path / "d", texts)))
     recipe = dataclasses.replace(make(), tasks=tasks, demos=demos)
@@ -174,7 +174,7 @@ def test_what_cannot_be_told_apart_is_refused_before_anything_is_decoded(
 
 
 def test_a_set_of_some_suites_is_told_apart_from_scenes_of_others(tmp_path: Path) -> None:
-    """`turn on the stove` is also said in libero/90, of which this set has nothing."""
+    """`turn on the stove` also occurs in libero/90, of which this set has nothing."""
     texts = texts_of("libero/goal", "libero/10")
     folder = libero(tmp_path / "d", texts)
     for task in ("libero/goal", "libero/goal-7", "libero/10-5"):
@@ -202,7 +202,7 @@ def test_of_a_dataset_on_the_hub_only_the_tasks_files_are_downloaded(
 def test_words_are_read_before_frames_which_may_stay_in_their_videos(
     cache: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As in a run of one task; words that other tasks have are not read."""
+    """As in a run of one task; words that only other tasks have are not read."""
     folder = libero(tmp_path / "d", texts_of("libero/goal", "libero/object"), as_video=True)
     recipe = stream(("libero/goal", "libero/object"), folder, cache=cache)
     frames = learned(recipe, 0).frames
@@ -225,7 +225,7 @@ def test_words_are_read_before_frames_which_may_stay_in_their_videos(
 
 
 def test_each_task_takes_the_episodes_that_are_chosen_for_it(make: Make, tmp_path: Path) -> None:
-    """As a run of one task takes them; the others' numbers are in no scale."""
+    """As in a run of one task; the others' numbers do not affect any scale."""
     recipe = make()
     chosen = ("0-3", "2,5,4")
     recipe = dataclasses.replace(recipe, demos=dataclasses.replace(recipe.demos, only=chosen))
@@ -248,7 +248,7 @@ def test_numbers_decide_where_instructions_do_not(tmp_path: Path) -> None:
 
 
 def test_episodes_of_another_task_are_refused(tmp_path: Path) -> None:
-    """As where `only` has the order of another recipe."""
+    """As when `only` has the order of another recipe."""
     folder = libero(tmp_path / "d", [*table.instructions("libero/10"), *["any words"] * 10])
     recipe = stream(("libero/10", "libero/goal"), folder, only=("10-19", "0-9"))
     assert taken(recipe, 0) == list(range(10, 20))
@@ -288,7 +288,7 @@ def test_cameras_are_known_by_their_new_names(tmp_path: Path) -> None:
 def test_a_run_acts_by_a_camera_that_was_renamed_away(
     make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """While it is trained, and when it is read again."""
+    """During training, and when it is loaded again."""
     monkeypatch.setattr(sim, "cameras", lambda name: ("top", "side"))
     load = demonstrations.load
 
@@ -319,7 +319,7 @@ def test_a_name_that_no_set_has_is_refused(make: Make, tmp_path: Path) -> None:
     [{"only": ("0-3", "0-3")}, {"only": ("4-6", "0-3")}, {"rename": {"a": "b"}}],
 )
 def test_what_is_chosen_tells_runs_and_cells_apart(keys: Mapping[str, Any], make: Make) -> None:
-    """The digest of the files says nothing of it. Runs from before there was the key go on."""
+    """The digest of the files does not show it. Runs from before the key existed can resume."""
     plain = make()
     chosen = dataclasses.replace(plain, demos=dataclasses.replace(plain.demos, **keys))
     assert "demos" not in recipes.training_part(plain)
@@ -329,7 +329,7 @@ def test_what_is_chosen_tells_runs_and_cells_apart(keys: Mapping[str, Any], make
 
 
 def test_a_cell_is_told_by_the_files_that_its_tasks_read(tmp_path: Path) -> None:
-    """A set of which every episode has files of its own."""
+    """A set in which every episode has its own files."""
     texts = texts_of("libero/goal", "libero/object", each=1)
     folder = as_version_2(libero(tmp_path / "d", texts), "v2.1")
     runner = RobotStreamRunner(tmp_path / "study", ignore)

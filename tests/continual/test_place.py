@@ -1,4 +1,4 @@
-"""Where a stream is: what was saved is taken up again, and anything else is refused."""
+"""The position in a stream: what was saved is resumed, and anything else is refused."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Streams of robot tasks that no simulator has: the error of the actions on held-out episodes."""
+"""Streams of robot tasks without a simulator: the action error on held-out episodes."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_errors_are_those_of_an_evaluation_of_held_out_frames(
     run = robots.load_to_act(out)
     for number, task in enumerate(TASKS):
         shown = robot_demos.load(real(method), number, run.model.backbone, out, lambda event: None)
-        # Those that no step has learned from, evenly spread.
+        # Frames that no step has learned from, evenly spread.
         assert len(shown.validation) > FRAMES
         at = shown.validation[spread.rows(len(shown.validation), FRAMES)]
         assert not set(at.tolist()) & set(shown.train.tolist())
@@ -167,7 +167,7 @@ def test_interrupted_anywhere_and_resumed_it_ends_in_the_same_bytes(
 ) -> None:
     begin = partial(train.run, real(method), tmp_path / "run")
     for place in at_each(PLACES[method], begin):
-        if place == ("stream", 1):  # what is known so far lies there already
+        if place == ("stream", 1):  # the results so far already exist
             so_far = json.loads((tmp_path / "run" / "error_matrix.json").read_text())
             whole = done(method)[0]
             assert so_far["errors"] == [list(whole.errors[0])]
@@ -329,7 +329,7 @@ def test_what_cannot_be_trained(
 def test_demonstrations_of_a_simulated_task_are_told_by_what_they_say(
     place: Path, bad: Callable[..., str], demos_file: Path
 ) -> None:
-    """Before anything is decoded."""
+    """They are refused before anything is decoded."""
     given = f"demos.paths=[{demos_file}, picked]"
     says = ("demonstrations of 'reach'", "for the task 'reech'", "call the task 'reach'")
     bad(*TRAIN, "--set", "tasks=[reech, pick]", "--set", given, says=says)
@@ -363,7 +363,7 @@ def test_two_tasks_with_the_same_episodes_are_refused_before_anything_is_decoded
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Also where the dataset is named in two ways."""
+    """This holds even if the dataset is named in two ways."""
     (tmp_path / "link").symlink_to(paths["pick"])
     monkeypatch.setattr(demonstrations, "load", lambda *given, **options: pytest.fail("decoded"))
     demos = RobotDemos(paths=(str(paths["pick"]), str(tmp_path / "link")), only=only)

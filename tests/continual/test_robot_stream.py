@@ -1,4 +1,4 @@
-"""Streams of robot tasks: what later tasks leave of earlier ones, and what is resumed and told."""
+"""Streams of robot tasks: how much of earlier tasks is kept, and what is resumed and reported."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ SIZES = {"reach": 6, "point": 2}
 
 @pytest.fixture(scope="module")
 def done(make: Make, tmp_path_factory: pytest.TempPathFactory) -> Done:
-    """A finished run of a learner; read only."""
+    """A finished run of a learner; read-only."""
     made: dict[str, tuple[RobotStreamReport, Path]] = {}
 
     def get(method: str) -> tuple[RobotStreamReport, Path]:
@@ -79,7 +79,7 @@ def done(make: Make, tmp_path_factory: pytest.TempPathFactory) -> Done:
 
 
 def chunks(run: RobotStreamRun, task: int) -> torch.Tensor:
-    """What the policy of a task does, on pictures and positions that are always the same."""
+    """The actions of a task's policy, always on the same pictures and positions."""
     size = SIZES[run.names[task]]
     proprio = torch.randn(3, size, generator=torch.Generator().manual_seed(1))
     run.activate(task)
@@ -131,7 +131,7 @@ def test_what_to_lower_are_the_rates_of_what_learns(
 def test_a_learned_tasks_actions_are_bit_identical_after_the_next(
     method: str, keeps: bool, order: tuple[str, ...], make: Make, tmp_path: Path
 ) -> None:
-    """Also where the second task has more positions than the first."""
+    """This holds even if the second task has more positions than the first."""
     built = train.build(make(method, order), tmp_path)
     learn(built, 1)
     first, own = chunks(built, 0), snapshot(iter(robots.own_parameters(built.model.expert).items()))
@@ -145,7 +145,7 @@ def test_a_learned_tasks_actions_are_bit_identical_after_the_next(
 
 
 def learn(run: RobotStreamRun, tasks: int) -> None:
-    """Train until so many tasks are learned, and evaluate none."""
+    """Train until this many tasks are learned, and evaluate none."""
     (run.out / "metrics.jsonl").touch()
     while run.current.task < tasks:
         loop.learn(run, [], None, lambda event: None)
@@ -178,7 +178,7 @@ def test_sequential_changes_the_vlm(done: Done) -> None:
 def test_which_maps_get_experts_and_what_learns_when(method: str, done: Done) -> None:
     report, _ = done(method)
     maps = [{site.site for site in record.sites} for record in report.records]
-    # not of layer 1, the last: its maps are behind the last keys and values, and no action reads
+    # not layer 1, the last: its maps come after the last keys and values, and no action reads
     # them
     assert maps[0] == {f"backbone.layers.0.{name}" for name in ("out", "up", "down")}
     layers = {
@@ -224,7 +224,7 @@ def test_what_is_frozen_stays_bit_for_bit_where_all_weights_learn(
     after = dict(built.model.backbone.named_parameters())
     for name, before in backbones.load(str(tiny_folder)).named_parameters():
         held = name.startswith(tuple(f"{part}." for part in parts))
-        # What lies behind all that the action expert reads has no gradient.
+        # Whatever comes after the parts that the action expert reads has no gradient.
         if held or name in ("layers.1.qkv.weight", "stem.halve.0.weight", "words.weight"):
             assert same_bits(before, after[name]) == held, name
 
@@ -273,7 +273,7 @@ def test_to_freeze_what_would_not_learn_or_everything_is_refused_before_anything
 def test_what_is_missing_of_a_robot_is_zero_and_not_learned(
     method: str, make: Make, tmp_path: Path
 ) -> None:
-    """Two positions in an expert for six: columns and noise that no loss reads."""
+    """Two positions in an expert for six: no loss reads the other columns and noise."""
     built = train.build(make(method), tmp_path / "run")
     assert built.model.expert.shape.proprio == 6
     assert [len(p.proprio_scale.mean) for p in built.policies] == [6, 2]
@@ -286,7 +286,7 @@ def test_what_is_missing_of_a_robot_is_zero_and_not_learned(
 
 @pytest.mark.parametrize("actions", [1, 2, 3])
 def test_actions_that_a_robot_lacks_do_not_dilute_its_loss(actions: int) -> None:
-    """A policy of `actions` in an expert for three, whose output for the others is anything."""
+    """A policy of `actions` in an expert for three, whose other outputs are arbitrary."""
     torch.manual_seed(0)
     wide = make_policy()
     shape = dataclasses.replace(wide.expert.shape, actions=3)
@@ -340,7 +340,7 @@ def test_each_part_learns_at_its_own_rate(
 
 @pytest.mark.parametrize("method", ["igsp", "sequential"])
 def test_the_loss_falls(method: str, make: Make, tmp_path: Path) -> None:
-    """In both tasks, over more steps than the stream's tests take."""
+    """In both tasks, over more steps than the stream's other tests."""
     built = train.build(make(method, steps=24, batch_size=16, checkpoint_every=24), tmp_path)
     learn(built, 2)
     lines = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
@@ -396,7 +396,7 @@ def test_a_probe_of_the_files_gives_the_same_figures(method: str, done: Done) ->
 def test_success_is_what_closed_loops_say(
     done: Done, make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Every entry is a rollout of its task with its own policy, as the recipe has it."""
+    """Every entry is a rollout of its task with its own policy, with the recipe's settings."""
     played = []
 
     def play(
@@ -433,7 +433,7 @@ def test_settings_are_chosen_by_other_questions_than_the_probes(
 def test_questions_that_were_edited_are_not_set_beside_the_old_ones(
     make: Make, tmp_path: Path
 ) -> None:
-    """Neither by a probe of the run nor by its continuation."""
+    """This holds for a probe of the run and for its continuation."""
     lines = write_jsonl(tmp_path / "asked", 40)
     asking = make("sequential", steps=1, probe=Probe(vqa=str(lines), questions=7))
     train.run(asking, tmp_path / "done")
@@ -450,7 +450,7 @@ def test_questions_that_were_edited_are_not_set_beside_the_old_ones(
 
 
 def test_a_question_file_that_is_gone_is_named(make: Make, tmp_path: Path) -> None:
-    """A data set of several files can lose one, and is another set then."""
+    """A data set with several files can lose one, and is then another set."""
     rows = datasets.Dataset.from_dict(hub_rows(60))
     asked = tmp_path / "asked"
     asked.mkdir()
@@ -491,7 +491,7 @@ def test_a_rollout_of_the_run_acts_as_the_training_did(
 def of_any_size(
     make: Make, hf_folder: Callable[[str], Path], tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Path, list[tuple[int, ...]]]:
-    """A stream whose backbone takes any pictures, and in which sizes it saw those of rollouts."""
+    """A stream whose backbone accepts any size, and the sizes it saw in rollouts."""
     out, shown = tmp_path_factory.mktemp("any") / "run", []
     wanted = make("sequential", steps=1, backbone=str(hf_folder("paligemma")))
     load, act, sizes = demonstrations.load, Policy.act, {"reach": (40, 60), "point": (48, 48)}
@@ -514,7 +514,7 @@ def of_any_size(
 def test_rollouts_of_a_stream_show_pictures_in_the_sizes_of_each_tasks_training(
     of_any_size: tuple[Path, list[tuple[int, ...]]],
 ) -> None:
-    """While it is trained, in `aegis rollout` and in `load_policy`."""
+    """During training, in `aegis rollout` and in `load_policy`."""
     out, shown = of_any_size
     assert set(shown) == {(40, 60), (48, 48)}
     for task, size in (("reach", (40, 60)), ("point", (48, 48))):
@@ -540,7 +540,7 @@ def test_a_damaged_view_is_one_error(
 def test_a_stream_acts_by_the_camera_that_its_demonstrations_were_seen_by(
     make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As a policy of one task does; other names of the only camera are the task's own."""
+    """As for a policy of one task; other names of the only camera are the task's own."""
     monkeypatch.setattr(sim, "cameras", lambda name: ("top", "side"))
     load = demonstrations.load
 
@@ -559,7 +559,7 @@ def test_a_stream_acts_by_the_camera_that_its_demonstrations_were_seen_by(
 
 ONE, TWO = "task 1 reach", "task 2 point"
 PLACES = {
-    # In phase 1 and 2 of either task, while the first is tried, and after each.
+    # In phases 1 and 2 of either task, while the first is evaluated, and after each.
     "igsp": (
         (ONE, 1),
         (ONE, 5),
@@ -594,7 +594,7 @@ def test_interrupted_anywhere_and_resumed_it_ends_in_the_same_bytes(
 
 
 def assert_learned_and_tried(cut: Path, whole: Path) -> None:
-    """The first task of an interrupted stream, which is not done again."""
+    """The first task of an interrupted stream is not done again."""
     saved = artifacts.read_header(cut / state.STATE).meta["place"]
     assert (saved["task"], saved["step"]) == (1, 0)
     assert (len(saved["records"]), len(saved["vqa"])) == (1, 2)
@@ -614,7 +614,7 @@ LATER = (("train", "freeze"), ("probe", "while_training"))
 def test_a_run_that_an_earlier_version_began_goes_on_to_the_same_bytes(
     unknown: tuple[tuple[str, str], ...], make: Make, done: Done, tmp_path: Path
 ) -> None:
-    """It wrote all keys that it knew into the recipe, and digested all of some sections."""
+    """That version wrote all keys it knew into the recipe, and digested all of some sections."""
     recipe, out = make("igsp"), tmp_path / "run"
     with pytest.raises(KeyboardInterrupt):
         train.run(recipe, out, on_event=partial(stop, TWO, 3))
@@ -641,7 +641,7 @@ def test_a_state_of_another_recipe_is_refused(make: Make, tmp_path: Path) -> Non
 
 
 def began_with(run: Path, digest: str) -> None:
-    """Let the state of an interrupted run say that its recipe had this digest."""
+    """Make the state of an interrupted run say that its recipe had this digest."""
     saved = artifacts.load(run / state.STATE)
     inputs = {**saved.header.inputs, "recipe": digest}
     assert inputs != saved.header.inputs

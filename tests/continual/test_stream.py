@@ -1,4 +1,4 @@
-"""A stream from end to end: what is never forgotten, what each figure says, and what is resumed."""
+"""A stream from end to end: what is never forgotten, what the figures mean, what is resumed."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ TASKS = STREAMS["small"]
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    """Every file's bytes but the metrics', which hold times."""
+    """The bytes of every file except the metrics, which contain times."""
     return {
         str(p.relative_to(folder)): p.read_bytes()
         for p in folder.rglob("*")
@@ -53,7 +53,7 @@ def logged(folder: Path) -> list[tuple[int, int]]:
 
 
 def zero_shot(i: int) -> float:
-    """Accuracy of the bare encoder on a task, by hand."""
+    """Accuracy of the bare encoder on a task, computed by hand."""
     model, part = TinyDual(), TASKS[i].test
     with torch.no_grad():
         features = model.image_features(model.pixels(part.images(torch.arange(len(part)))))
@@ -76,7 +76,7 @@ STRICT = {
 def done(
     tmp_path_factory: pytest.TempPathFactory,
 ) -> Callable[[str], tuple[ImageStreamReport, Path]]:
-    """A finished run of each learner, and of `strict` settings of igsp; read only."""
+    """A finished run of each learner, and of `strict` settings of igsp; read-only."""
     made: dict[str, tuple[ImageStreamReport, Path]] = {}
 
     def get(name: str) -> tuple[ImageStreamReport, Path]:
@@ -149,7 +149,7 @@ def test_nothing_is_forgotten_with_the_task_told(done: Done, method: str) -> Non
 def test_old_tasks_logits_are_bit_identical_after_later_tasks(
     done: Done, method: str, tmp_path: Path
 ) -> None:
-    """The first task alone, and as the first of three."""
+    """For the first task alone, and as the first of three."""
     alone = recipe(method, order=("one",))
     train.run(alone, tmp_path / "alone")
     found = []
@@ -168,7 +168,7 @@ def test_old_tasks_logits_are_bit_identical_after_later_tasks(
 
 @pytest.mark.parametrize("precision", ["float32", "bf16"])
 def test_training_teaches(precision: str, tmp_path: Path) -> None:
-    """Isolated terms, over enough steps, beat the bare encoder on each task by a margin."""
+    """Isolated terms with enough steps beat the bare encoder on each task by a margin."""
     report = train.run(recipe("isolated-lora", steps=40, precision=precision), tmp_path / "run")
     assert all(report.oracle[i][i] > zero_shot(i) + 0.1 for i in range(3))
     assert len({r.trained for r in report.records}) == 1  # what an earlier task trained is frozen
@@ -177,9 +177,9 @@ def test_training_teaches(precision: str, tmp_path: Path) -> None:
 def test_a_task_that_comes_again_adds_little(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """Routing leads the same pictures and names to the experts that are there.
+    """Routing leads the same pictures and names to the existing experts.
 
-    With `reuse: 0` it leads no further than that.
+    With `reuse: 0` it does so less.
     """
     names = tuple(f"thing {c}" for c in "abc")
     twins = tuple(
@@ -227,7 +227,7 @@ def test_phase_1_ends_when_the_routers_stand_still(tmp_path: Path) -> None:
     assert steps == {
         1.0: [6, 6],
         0.0: [11, 11],
-    }  # two quiet checks after the first; never, so its share of the steps
+    }  # two quiet checks after the first; never, so its share of the steps ends it
 
 
 def test_a_step_trains_and_a_measurement_does_not(
@@ -266,7 +266,7 @@ def test_what_goes_on_learning_after_phase_1_keeps_its_moments(
         }
         settle(run, training, flows)
         learning = list(run.learning().values())
-        assert set(training.optimizer.state) == set(learning)  # what left or is fixed is forgotten
+        assert set(training.optimizer.state) == set(learning)  # what is gone or frozen is forgotten
         for p in learning:
             now = training.optimizer.state[p]
             assert all(torch.equal(now[key], old) for key, old in before[id(p)].items())
@@ -348,7 +348,7 @@ def test_the_threshold_sends_images_to_the_bare_encoder(tmp_path: Path) -> None:
         run.gaussians,
     )
     assert (chosen == gaussians.NONE).double().mean() > 0.9
-    width, rank = 16, 15  # of 16 asked for, at most one less than the looks have entries
+    width, rank = 16, 15  # of 16 requested; at most one less than the number of looks' entries
     assert report.inference_parameters == width + rank * width + rank + 2
 
 
@@ -359,9 +359,9 @@ def test_the_threshold_sends_images_to_the_bare_encoder(tmp_path: Path) -> None:
 def test_what_never_changes_is_computed_once_and_at_the_end(
     method: str, passes: int, done: Done, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A frozen learner's task is answered when it has been learned, and again by the last row.
+    """A frozen learner's task is answered once it has been learned, and again in the last row.
 
-    The last row sees what has changed.
+    The last row shows whatever has changed.
     """
     report, out = done(method)
     run, evaluator = loaded(method, out)
@@ -430,7 +430,7 @@ def test_a_probe_of_other_inputs_is_one_error_and_leaves_the_matrix(
         monkeypatch.setattr(
             images.backbones, "load_dual", lambda n: TinyDual(seed=5) if n == "tiny" else own(n)
         )
-    if (method, other) == ("sequential", "encoder"):  # it ends with an encoder of its own
+    if (method, other) == ("sequential", "encoder"):  # it ends with its own encoder
         assert probe.run(out).largest_difference == 0
     else:
         with pytest.raises(AegisError, match=f"a different {other} than the run") as caught:
@@ -474,7 +474,7 @@ def test_each_task_tells_its_beginning(tmp_path: Path) -> None:
 def test_igsp_interrupted_anywhere_and_resumed_ends_in_the_same_bytes(
     name: str, tmp_path: Path, done: Done
 ) -> None:
-    """With a checkpoint after each step, and with steps between them that are repeated."""
+    """With a checkpoint after each step, and with steps in between that are repeated."""
     begin = partial(train.run, STRICT[name], tmp_path / "run")
     for _ in at_each(PLACES, begin):
         pass
@@ -524,9 +524,9 @@ def whole(accuracy: float, images: int) -> bool:
 def test_a_run_on_validation_parts_says_so_and_stays_on_them(
     method: str, tmp_path: Path, done: Done
 ) -> None:
-    """No accuracy is of test parts, though the run is interrupted, resumed and probed.
+    """No accuracy is from test parts, though the run is interrupted, resumed and probed.
 
-    It is resumed by its own recipe, as `aegis inspect` advises.
+    It is resumed with its own recipe, as `aegis inspect` advises.
     """
     asked = recipe(method, split="validation")
     wanted = train.run(asked, tmp_path / "whole")
@@ -549,7 +549,7 @@ def test_a_run_on_validation_parts_says_so_and_stays_on_them(
 
 @pytest.mark.parametrize("begun", ["test", "validation"])
 def test_a_run_does_not_go_on_with_other_parts(begun: str, tmp_path: Path) -> None:
-    """Neither one that was interrupted nor one that is finished."""
+    """Neither an interrupted run nor a finished one."""
     other = {"test": "validation", "validation": "test"}[begun]
     with pytest.raises(KeyboardInterrupt):
         train.run(
@@ -651,7 +651,7 @@ WILD = {
 def test_a_training_that_diverges_says_where_and_which_rates_it_read(
     method: str, keys: list[str], tmp_path: Path
 ) -> None:
-    """The advice works: rates of these keys that are nought move nothing."""
+    """The advice works: if the rates under these keys are zero, nothing moves."""
     with pytest.raises(Diverged, match="of task 'one'") as caught:
         train.run(recipe(method, **WILD[method]), tmp_path / "run")
     assert caught.value.fix == f"try a lower {' or '.join(keys)}"

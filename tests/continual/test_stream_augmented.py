@@ -1,4 +1,4 @@
-"""`train.augment` of streams of robot tasks."""
+"""`train.augment` in streams of robot tasks."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_each_step_changes_its_frames_anew_and_what_is_measured_sees_them_as_the
         assert torch.equal(task.fetch(rows).images, bare.images)
         for step in range(2):
             found = task.fetch(rows, step)
-            # By the step of the whole stream.
+            # By the step count of the whole stream.
             given = bare.images, frames.tolist(), NAMES, 1, 0, number * STEPS + step
             assert torch.equal(found.images, augment.augmented(*given))
             assert not torch.equal(found.images, bare.images)

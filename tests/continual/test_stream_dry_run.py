@@ -1,4 +1,4 @@
-"""`aegis train --dry-run` of a stream of robot tasks: what it tells, and that it writes nothing."""
+"""`aegis train --dry-run` for a stream of robot tasks: its report, and that it writes nothing."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_each_task_learns_what_the_training_lets_it_learn(
     report = train.run(recipe, tmp_path / "run")
     for record in report.records:
         told = found.tasks[record.task]
-        # Of igsp nothing was pruned before the task here, so that it may be more.
+        # In the dry run igsp has not pruned before the task, so there may be more.
         learned = record.trained if method != "igsp" else record.trained_phase1
         assert told["trainable"] is not None and told["trainable"] >= (learned or 0) > 0
         if method != "igsp" or record.task == TASKS[0]:
@@ -71,7 +71,7 @@ def test_time_and_memory_are_of_real_steps(
     assert found.hours is not None and found.measuring_s is not None
     looked = {"routing"} if method == "igsp" else set()
     assert found.measuring_s.keys() == {"questions", "loss", *(f"task {t}" for t in TASKS), *looked}
-    # All steps, and what is measured before the first task and after each.
+    # All steps, and the measurements before the first task and after each.
     times, steps_s = found.measuring_s, sum(told["step_s"] or 0 for told in found.tasks.values())
     seconds = STEPS * steps_s + 3 * times["questions"] + 2 * times["loss"]
     seconds += 2 * times[f"task {TASKS[0]}"] + times[f"task {TASKS[1]}"]
@@ -89,7 +89,7 @@ def test_later_tasks_have_the_experts_of_all_before(real: Make, tmp_path: Path) 
         demos=RobotDemos(paths=(*recipe.demos.paths, str(robot(tmp_path / "again")))),
     )
     of_two, of_three = (dry_run.run(each, tmp_path / "run") for each in (recipe, three))
-    # With the second task the action expert's maps get experts, whose routers read old ones then.
+    # With the second task the action expert's maps get experts; their routers then read old ones.
     learning = [told["trainable"] for told in of_three.tasks.values()]
     assert learning[2] > learning[1] and list(of_two.tasks) == list(TASKS)
     first, between, last = (told["step_s"] for told in of_three.tasks.values())

@@ -36,7 +36,7 @@ def warnings_of(*given: Any, **options: Any) -> list[str]:
 
 @pytest.mark.parametrize("method", ["igsp", "isolated-lora", "sequential"])
 def test_the_error_is_the_one_that_the_training_measured(method: str, done: Done) -> None:
-    """That of the task's own policy, at the same frames, whichever task was asked for before."""
+    """It is for the task's own policy, at the same frames, whichever task was evaluated before."""
     measured, out = done(method)
     before = contents(out)
     for number, task in reversed(list(enumerate(TASKS))):
@@ -72,7 +72,7 @@ def test_each_task_has_its_own_part_of_one_dataset(
     assert own[0] <= {0, 1, 2} and own[1] <= {3, 4, 5} and all(own)
     mixed = evaluate.run(tmp_path / "run", "open-drawer", episodes=range(6))
     assert mixed.split == "chosen" and set(mixed.trained_on) == {3, 4, 5} - own[1]
-    # All weights go on learning, so that either task has learned from the other's episodes too.
+    # All weights continue to learn, so each task has also learned from the other's episodes.
     for task, other in (TASKS, TASKS[::-1]):
         told = warnings_of(tmp_path / "run", task, episodes=range(6))
         assert [text for text in told if f"trained on as '{other}' of the same stream" in text]

@@ -28,7 +28,7 @@ CLOSE = {"rtol": 1e-4, "atol": 1e-6}
 
 
 def taken(recipe: RobotStreamRecipe, out: Path) -> tuple[RobotStreamRun, float, dict[str, Tensor]]:
-    """A run after a step of its second task: the step's loss, and the gradients that it took."""
+    """A run after a step of its second task: the step's loss and gradients."""
     run = robots.build(recipe, out)
     begun = dry_run._Begun.at(run, 0)
     loop.take(run, begun.training, 0, begun.training.fetch(0))
@@ -51,7 +51,7 @@ def same(found: dict[str, Tensor], wanted: dict[str, Tensor]) -> None:
 def test_a_step_in_passes_has_the_loss_and_the_gradients_of_one(
     method: str, real: Make, tmp_path: Path
 ) -> None:
-    """Also where the passes differ by a frame, and in what igsp adds to the loss."""
+    """This holds if the passes differ by a frame, and for igsp's terms of the loss."""
     _, wanted_loss, wanted = taken(real(method), tmp_path / "run")
     for passes in (2, 3, 4):
         _, loss, found = taken(real(method, accumulate=passes), tmp_path / "run")
@@ -60,7 +60,7 @@ def test_a_step_in_passes_has_the_loss_and_the_gradients_of_one(
 
 
 def test_what_igsp_charges_is_paid_once_in_all_passes(real: Make, tmp_path: Path) -> None:
-    """Its gradient alone: at a price at which it outweighs the task's."""
+    """This is about its gradient alone, at a price at which it outweighs the task's."""
     dear = dataclasses.replace(real("igsp").igsp, reuse=1e4, norm=1e3)
     _, _, wanted = taken(real("igsp", igsp=dear, clip_norm=1e9), tmp_path / "run")
     _, _, found = taken(real("igsp", igsp=dear, clip_norm=1e9, accumulate=4), tmp_path / "run")
@@ -86,7 +86,7 @@ def test_a_pass_sees_its_own_frames_alone(
     loop.take(run, training, 0, training.fetch(0))
     assert seen == [2, 2]
     seen.clear()
-    if run.sites:  # routers are measured in no larger passes
+    if run.sites:  # routers are not measured in larger passes
         loop.measure(run, training)
         assert set(seen) <= {1, 2} and sum(seen) == len(training.objective._calibration)  # type: ignore[attr-defined]
 
@@ -158,7 +158,7 @@ def test_less_is_kept_of_a_pass(hugging_face: Make, tmp_path: Path) -> None:
 def test_interrupted_and_resumed_it_ends_in_the_same_bytes(
     method: str, hugging_face: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(robots, "CALIBRATION_FRAMES", 6)  # to measure routers takes the most time
+    monkeypatch.setattr(robots, "CALIBRATION_FRAMES", 6)  # measuring routers takes the most time
     recipe = hugging_face(method, steps=4, gradient_checkpointing=True, accumulate=2)
     assert_resumes(recipe, tmp_path)
 

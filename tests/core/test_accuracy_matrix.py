@@ -1,4 +1,4 @@
-"""Transfer, Average, Last and forgetting against matrices worked by hand, and their bounds."""
+"""Transfer, Average, Last and forgetting against hand-computed matrices, and their bounds."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def test_a_matrix_worked_by_hand() -> None:
 
 
 def test_the_best_counts_from_the_tasks_own_learning_on() -> None:
-    """What was there before a task was learned is no memory of it."""
+    """Accuracy from before a task was learned does not count as remembered."""
     assert scores([[0.5, 0.9], [0.5, 0.6]]).forgetting == 0
     assert scores([[0.5, 0.1], [0.7, 0.6]]).forgetting == 0  # later tasks may help
     assert scores([[0.5, 0.0, 0.0], [0.9, 0.0, 0.0], [0.6, 0.0, 0.0]]).forgetting == pytest.approx(

@@ -1,4 +1,4 @@
-"""A chunk that continues another one: the paper's weights and guidance, and what they come to."""
+"""A chunk that continues another one: the paper's weights and guidance, and their effect."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ def test_weights_fall_from_what_is_executed_to_what_is_free(seed: int) -> None:
 
 
 def test_weights_between_are_those_of_the_paper() -> None:
-    """Its equation 5, for H = 8 of which 3 were executed, and a delay of 2."""
+    """Equation 5, for H = 8 of which 3 were executed, and a delay of 2."""
     shares = np.array([3, 2, 1]) / 4  # (H - s - i) / (H - s - d + 1) for i = 2, 3, 4
     expected = [1, 1, *(shares * (np.exp(shares) - 1) / (np.e - 1)), 0, 0, 0]
     np.testing.assert_allclose(continuation.weights(5, 2, 8), expected, rtol=1e-6)
 
 
 def test_the_strength_is_the_papers() -> None:
-    """Its equations 2 and 4, in which time runs from the noise at 0 to the action at 1."""
+    """Equations 2 and 4, where time runs from the noise at 0 to the action at 1."""
     times = torch.linspace(0.01, 1, 50, dtype=torch.float64)
     toward = 1 - times
     spread = (1 - toward).square() / (toward.square() + (1 - toward).square())
@@ -43,7 +43,7 @@ def test_the_strength_is_the_papers() -> None:
 
 
 def of_a_gaussian(covariance: Tensor) -> Velocity:
-    """The exact velocity of chunks [B, H, 1] that are drawn from N(0, covariance [H, H])."""
+    """The exact velocity for chunks [B, H, 1] drawn from N(0, covariance [H, H])."""
     eye = torch.eye(len(covariance), dtype=covariance.dtype)
 
     def velocity(x: Tensor, time: Tensor) -> Tensor:
@@ -56,14 +56,14 @@ def of_a_gaussian(covariance: Tensor) -> Velocity:
 
 
 def smooth(horizon: int, length: float) -> Tensor:
-    """The covariance [H, H] of chunks whose steps resemble those nearby."""
+    """The covariance [H, H] of chunks whose neighbouring steps are similar."""
     step = torch.arange(horizon, dtype=torch.float64)
     return torch.exp(-((step[:, None] - step) ** 2) / (2 * length**2)) + 1e-3 * torch.eye(horizon)
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_the_pull_is_that_of_the_derivative(seed: int) -> None:
-    """Of a linear velocity the derivative is known: (I - t M)^T."""
+    """The derivative of a linear velocity is known: (I - t M)^T."""
     generator = torch.Generator().manual_seed(seed)
     horizon, left, delay, t = 6, 4, 2, 0.4
     matrix = torch.randn(horizon, horizon, generator=generator, dtype=torch.float64)
@@ -96,7 +96,7 @@ def test_where_nothing_is_left_nothing_changes() -> None:
 def test_what_is_free_follows_what_is_held_as_its_conditional_mean_does(
     length: float, delay: int
 ) -> None:
-    """From the middle of the noise; guidance by pseudo-inverse comes near it, and not more."""
+    """From the mean of the noise; guidance by pseudo-inverse comes near it, but no nearer."""
     horizon, draws = 8, torch.Generator().manual_seed(0)
     covariance = smooth(horizon, length)
     held = covariance[:delay, :delay]
@@ -111,7 +111,7 @@ def test_what_is_free_follows_what_is_held_as_its_conditional_mean_does(
 
 
 def test_the_new_chunk_begins_as_the_old_one_goes_on_and_stays_smooth() -> None:
-    """Of smooth chunks; without guidance the step over to the new one is a jump."""
+    """For smooth chunks; without guidance the transition to the new one is a jump."""
     horizon, left, delay = 16, 12, 4
     velocity = of_a_gaussian(smooth(horizon, 4))
     draws = torch.Generator().manual_seed(1)
@@ -127,7 +127,7 @@ def test_the_new_chunk_begins_as_the_old_one_goes_on_and_stays_smooth() -> None:
     }
     assert jump_of["held"] < 1.5 * jump_of["old"] < 0.5 * jump_of["free"]
     off = (held - torch.nn.functional.pad(old, (0, 0, 0, horizon - left))).abs().mean((0, 2))
-    assert off[:delay].max() < 0.1 < off[left - 1]  # held where it is executed, and then let go
+    assert off[:delay].max() < 0.1 < off[left - 1]  # held where it is executed, then released
     roughness = held.diff(dim=1).diff(dim=1).square().mean()
     assert roughness < 2 * free.diff(dim=1).diff(dim=1).square().mean()
 

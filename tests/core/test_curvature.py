@@ -1,4 +1,4 @@
-"""The proximal step along VQA's curvature, against the penalty it belongs to."""
+"""The proximal step along VQA's curvature, compared with its penalty."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def draw(*shape: int) -> Tensor:
 
 
 def moment(size: int, rank: int | None = None) -> Tensor:
-    """A second moment whose directions differ much."""
+    """A second moment with very different directions."""
     rows = draw(50, rank or size) @ (
         draw(rank or size, size) * torch.logspace(0, 2, size, dtype=torch.float64)
     )
@@ -76,7 +76,7 @@ def test_the_step_minimises_distance_and_penalty(
 
     It is (X - D) + w (G + damping) X C.
 
-    Also where the anchor holds but the `rank` directions of the outputs that answers mind at all.
+    This also holds if the anchor has only the `rank` output directions that matter to answers.
     """
     displacement = draw(*shape), draw(shape[0]) if biased else None
     c, g = moment(displacement[0][0].numel() + biased), moment(shape[0], rank)
@@ -121,7 +121,7 @@ def test_neither_moments_scale_matters() -> None:
 
 
 def test_what_vqa_does_not_read_or_does_not_mind_is_free() -> None:
-    """A displacement outside either factor's span stays, and one inside both is all but undone.
+    """A displacement outside either factor's span stays; one inside both is almost undone.
 
     This holds whatever the strength.
     """
@@ -189,7 +189,7 @@ def test_input_directions_that_the_anchor_left_out_are_free() -> None:
 def test_directions_that_were_never_resolved_have_one_curvature(
     read: int, written: int, strength: float
 ) -> None:
-    """The step is that of the moments that such spectra stand for."""
+    """The step is that of the moments which such spectra represent."""
     displacement = draw(OUT, IN), draw(OUT)
     spectra, stand_for = {}, []
     for side, size, count in (("inputs", IN + 1, read), ("outputs", OUT, written)):

@@ -20,7 +20,7 @@ def chunks(*shape: int, seed: int = 0) -> list[torch.Tensor]:
 
 
 def naive(predicted: list[torch.Tensor], step: int, decay: float) -> torch.Tensor:
-    """Algorithm 2 of ACT by a table of all predictions of a step."""
+    """Algorithm 2 of ACT from a table of all predictions of a step."""
     own = [(step - at, chunk) for at, chunk in enumerate(predicted)]
     told = [chunk[..., age, :] for age, chunk in own if age < CHUNK]
     weights = [math.exp(-decay * i) for i in range(len(told))]
@@ -56,7 +56,7 @@ def test_it_lies_between_the_predictions() -> None:
 
 @pytest.mark.parametrize(("decay", "age"), [(1e6, CHUNK - 1), (-1e6, 0)])
 def test_of_a_large_decay_one_prediction_is_left(decay: float, age: int) -> None:
-    """The oldest of a positive one, as ACT has it, the newest of a negative one; all are finite."""
+    """The oldest for a positive decay, as in ACT, the newest for a negative one; all are finite."""
     ensemble, predicted = TemporalEnsemble(decay), chunks()
     for step, chunk in enumerate(predicted):
         found = ensemble.next(chunk)

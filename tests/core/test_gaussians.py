@@ -40,7 +40,7 @@ def test_density_is_that_of_a_normal_with_the_leading_directions_and_one_noise(
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_all_directions_are_the_whole_covariance(seed: int) -> None:
-    """What is left for the noise of five of six directions is the sixth."""
+    """With five of six directions kept, the noise is the sixth."""
     features = (
         cluster(seed, 1.0).double()
         @ torch.randn(6, 6, generator=torch.Generator().manual_seed(seed)).double()
@@ -54,7 +54,7 @@ def test_all_directions_are_the_whole_covariance(seed: int) -> None:
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_directions_tell_what_single_entries_do_not(seed: int) -> None:
-    """Two tasks of the same means and variances, correlated the other way round."""
+    """Two tasks with equal means and variances, but opposite correlation."""
     g = torch.Generator().manual_seed(seed)
     base, mirror = torch.randn(300, 1, generator=g), torch.tensor([1.0, 1.0, 1.0, -1.0, -1.0, -1.0])
     first, second = (
@@ -83,7 +83,7 @@ def test_images_go_to_their_task_and_strangers_to_none(seed: int) -> None:
 
 
 def test_each_task_has_a_threshold_of_its_own() -> None:
-    """What would do for a wide task is a stranger to a narrow one."""
+    """A distance that is normal for a wide task is a stranger to a narrow one."""
     g = torch.Generator().manual_seed(0)
     narrow, wide = 0.01 * torch.randn(200, 6, generator=g), 20 + torch.randn(200, 6, generator=g)
     tasks = [fit(narrow, 0, 0.0, 0.02), fit(wide, 0, 0.0, 0.02)]

@@ -115,7 +115,7 @@ def test_an_expert_goes_only_if_weight_and_load_are_both_small(
 def test_projections_split_a_matrix(seed: int, scale: float) -> None:
     g = torch.Generator().manual_seed(seed)
     old = [scale * torch.randn(9, r, generator=g) for r in (2, 3)]
-    old.append(old[0] @ torch.randn(2, 2, generator=g))  # nothing new
+    old.append(old[0] @ torch.randn(2, 2, generator=g))  # adds nothing new
     columns = basis(old)
     assert columns.shape == (9, 5)
     torch.testing.assert_close(columns.T @ columns, torch.eye(5).double())
@@ -136,11 +136,11 @@ HISTORY, RANK, INPUTS, OUTPUTS = 2, 2, 24, 16
 
 
 class Outcome(NamedTuple):
-    """What is found after phase 1 of a regression.
+    """The result of phase 1 of a regression.
 
-    It is the loss, what flows, the new expert's norm, and how many new experts stay; and which
-    share lies in history's columns, of what was learned and of what a step down the task's own
-    gradient would add.
+    It has the loss, the routing flow, the new expert's norm, and how many new experts stay; and the
+    share inside the span of history's columns, of what was learned and of what a gradient step of
+    the task would add.
     """
 
     loss: float
@@ -219,7 +219,7 @@ def identify(
 
 
 def _unit(change: Tensor) -> Tensor:
-    """Scaled so that it moves outputs by 1, root mean square, on normal inputs."""
+    """Scaled so that it moves outputs by 1 (root mean square) on normal inputs."""
     return change * OUTPUTS**0.5 / change.norm()
 
 
@@ -238,19 +238,19 @@ def test_a_target_inside_history_keeps_no_new_expert_and_one_outside_keeps_one(
 
 @pytest.mark.parametrize("seed", range(2))
 def test_mass_alone_would_throw_away_what_carries_the_fit(seed: int) -> None:
-    """The trap: without norm control a new expert grows while its weight falls below the limit."""
+    """The trap: without norm control a new expert grows while its weight falls under the limit."""
     trap, held = (identify(seed, 0.5, reuse=0.5, norm=norm, steps=350) for norm in (0.0, 0.003))
     uniform = 1 / (HISTORY + 1)
     assert trap.flow.mass[HISTORY] < 0.5 * uniform and trap.flow.load[HISTORY] > 0.25
     assert trap.norm > 5 * held.norm and held.flow.mass[HISTORY] > 2 * trap.flow.mass[HISTORY]
-    assert trap.kept == 1  # the load holds it
+    assert trap.kept == 1  # its load keeps it
 
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_the_regulariser_projects_the_gradient_on_history(seed: int) -> None:
     """||P_H g||^2 / ||g||^2 of a target half inside rises with `reuse`.
 
-    So does what has been learned there.
+    So does the share of what has been learned there.
     """
     off_, on, more = (
         identify(seed, 0.5, reuse=r, norm=0.01 * (r > 0), steps=20) for r in (0.0, 0.1, 0.2)
@@ -267,7 +267,7 @@ def test_the_regulariser_projects_the_gradient_on_history(seed: int) -> None:
 
 
 def sequence_map(seed: int) -> tuple[RoutedLinear, list[int], torch.Generator]:
-    """A map with two old experts and a new one, all with outputs, in the numbers' order.
+    """A map with two old experts and a new one, all with outputs, in the order of their numbers.
 
     Task 1 is active.
     """
@@ -286,7 +286,7 @@ def sequence_map(seed: int) -> tuple[RoutedLinear, list[int], torch.Generator]:
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_a_charge_is_the_gradient_of_the_mass_where_the_loss_reads(seed: int) -> None:
-    """With one map after it and two before, the charge reaches what a term of the loss would."""
+    """With one map after it and two before, the charge equals the gradient of such a loss term."""
     site, numbers, g = sequence_map(seed)
     before, behind = (nn.Linear(n, m).double() for n, m in ((INPUTS, INPUTS), (OUTPUTS, 1)))
     x, read_mask = (
@@ -310,7 +310,7 @@ def test_a_charge_is_the_gradient_of_the_mass_where_the_loss_reads(seed: int) ->
 
 @pytest.mark.parametrize("seed", [0, 2])
 def test_positions_that_no_loss_reads_decide_nothing(seed: int) -> None:
-    """One position of fifty is read, and what it asks for lies outside history.
+    """One position of fifty is read, and its target lies outside history.
 
     So the new expert stays alone.
     """
@@ -338,4 +338,4 @@ def test_positions_that_no_loss_reads_decide_nothing(seed: int) -> None:
         flow(p["map"], site.of(numbers)) for p in (passes, where_read(passes, error))
     )
     assert needed(of_read, kappa=0.5, load=0.1) == (HISTORY,) != needed(of_all, kappa=0.5, load=0.1)
-    assert of_all.mass[HISTORY] > 0.8  # priced at all positions, the others would leave it
+    assert of_all.mass[HISTORY] > 0.8  # if all positions counted, the others would remove it

@@ -1,4 +1,4 @@
-"""The ledger: rows come back as they went in, a resumed one continues, sums are as defined."""
+"""The ledger: rows are read as written, a resumed ledger continues, sums are as defined."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def test_tensors_are_copies() -> None:
 
 
 def test_rows_after_a_step() -> None:
-    """Of steps that have no row, the rows after them."""
+    """Steps without a row take the row after them."""
     ledger = Ledger(GROUPS, LAYERS)
     for step in (1, 2, 5):
         ledger.append(step, *row(step))
@@ -85,7 +85,7 @@ def test_rows_after_a_step() -> None:
 
 
 def test_many_rows_take_little_more_memory_than_their_numbers() -> None:
-    """A tensor for each row took ten times that, and a resumed run 15 seconds to make them."""
+    """A tensor per row took ten times that, and a resumed run needed 15 seconds to make them."""
     count = 100_000
     columns = {name: torch.rand(count, 3, dtype=torch.float64) for name in ("tt", "ta", "aa")}
     saved = columns | {"w2": torch.rand(count, 2), "step": torch.arange(1, count + 1)}

@@ -23,7 +23,7 @@ def draw(seed: int, *shape: int) -> Tensor:
 
 
 def moment(seed: int, size: int, decades: float = 2, rank: int | None = None) -> Tensor:
-    """A second moment whose directions differ by some powers of ten; positive definite."""
+    """A second moment whose directions differ by several powers of ten; positive definite."""
     rows = draw(seed, 50, rank or size) @ draw(seed + 100, rank or size, size)
     scale = torch.logspace(0, decades, size, dtype=torch.float64)
     rows = rows * scale[torch.randperm(size, generator=torch.Generator().manual_seed(seed))]
@@ -65,7 +65,7 @@ def test_both_matrices_are_diagonal_in_the_basis(seed: int) -> None:
 
 
 def test_moments_that_are_damped_by_less_than_rounding_are_refused() -> None:
-    few = draw(1, 3, 60)  # rows of 60 directions; most are read by none
+    few = draw(1, 3, 60)  # three rows in 60 dimensions: most directions are never read
     spectrum = decompose(few.T @ few)
     for damping in (1e-2, 1e-9):
         assert basis(damped(spectrum, damping), damped(spectrum, damping)).share.isfinite().all()
@@ -141,7 +141,7 @@ def test_a_huge_strength_keeps_nothing_that_questions_read(seed: int) -> None:
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_what_questions_do_not_read_is_kept_at_any_strength(seed: int) -> None:
-    """C_v is blind to the first inputs, as far as it is not damped."""
+    """C_v does not see the first inputs, except through damping."""
     d, c_r, c_v, g_r, g_v = problem(seed, decades=0.5)
     c_v[:3], c_v[:, :3] = 0, 0
     c_r[:3, 3:], c_r[3:, :3] = 0, 0
@@ -201,7 +201,7 @@ def test_a_map_that_nothing_reads_still_has_a_basis() -> None:
 
 
 def test_singular_moments_of_float32_spectra_are_safe_with_damping() -> None:
-    """Eigenvectors of a file are in float32, and a frame's moment has few directions."""
+    """A file's eigenvectors are float32, and a frame's moment has few directions."""
     few, many = moment(3, 40, rank=2), moment(4, 40)
     task, questions = (decompose(m.float().double(), 0.9999) for m in (few, many))
     found = basis(damped(task, 1e-3), damped(questions, 1e-3))

@@ -1,4 +1,4 @@
-"""Sums of second moments: exact where they are whole, and how close sketches come elsewhere."""
+"""Sums of second moments: exact if kept whole; how close sketches come otherwise."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ DECAYS = {"slow": -0.5, "middling": -0.8, "fast": -1.5}
 
 
 def rows(count: int, width: int, decay: float, seed: int = 0) -> Tensor:
-    """Rows [n, d] float32 with a mean of their own, whose deviations fall as a power law."""
+    """Rows [n, d] float32 with a nonzero mean, whose deviations fall as a power law."""
     generator = torch.Generator().manual_seed(seed)
     sizes = torch.arange(1, width + 1) ** decay
     turn = torch.linalg.qr(torch.randn(width, width, generator=generator))[0]
@@ -32,7 +32,7 @@ def summed(total: MomentSum, *parts: Tensor) -> MomentSum:
 
 
 def moment(spectrum: Spectrum) -> Tensor:
-    """The second moment that a spectrum stands for [d, d]."""
+    """The second moment [d, d] that a spectrum represents."""
     assert spectrum.vectors is not None
     vectors = spectrum.vectors.double()
     excess = spectrum.values[: vectors.shape[1]] - spectrum.rest
@@ -67,7 +67,7 @@ def test_the_widths_decide() -> None:
 
 
 def test_a_trace_stays_on_the_device_of_its_rows() -> None:
-    """Processes add theirs up there: NCCL knows no tensor of a CPU."""
+    """Processes sum their traces there, and NCCL cannot handle CPU tensors."""
     width, elsewhere = moment_sums.SKETCHED + 1, torch.device("meta")
     added = make(width, elsewhere)
     added.add(torch.empty(3, width, device=elsewhere))
@@ -151,7 +151,7 @@ def test_a_map_as_narrow_as_a_sketch_is_summed_whole() -> None:
 
 @pytest.mark.parametrize("rank", [20, 100])
 def test_a_sketch_with_nearly_as_many_columns_as_rows_is_close_to_the_moment(rank: int) -> None:
-    """Such a random matrix hardly sees some directions, where rounding is all there is."""
+    """Such a random matrix hardly sees some directions, in which only rounding is left."""
     width = 386
     x = rows(600, rank, DECAYS["slow"]) @ rows(rank, width, 0.0, seed=1)
     found = summed(make(width, CPU, whole=8), *x.split(6)).spectrum(len(x), 1.0)
@@ -168,7 +168,7 @@ def test_rows_of_zeros_have_no_direction() -> None:
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.bfloat16], ids=str)
 def test_a_programs_default_type_changes_no_sketch(dtype: torch.dtype) -> None:
-    """Somebody who loads models in bfloat16 may have made that the default."""
+    """A program that loads models in bfloat16 may have made that the default."""
     drawn = rows(500, WIDE, DECAYS["middling"])
     wanted = summed(make(WIDE, CPU), drawn).spectrum(500, 1.0)
     moment_sums._probe.cache_clear()

@@ -1,4 +1,4 @@
-"""Moments: merging equals concatenating, padding never counts, no digits lost far from zero."""
+"""Moments: merging equals concatenating, padding never counts, no precision lost far from zero."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_mean_1000_std_01_keeps_its_variance() -> None:
     cancelling = h.square().mean((0, 1)) - h.mean((0, 1)).square()
     assert (
         cancelling - 0.01
-    ).abs().max() > 0.01  # the formula that is not used is off by more than the answer
+    ).abs().max() > 0.01  # the unused formula is off by more than the answer
     assert_same(masked_moments(h, mask), direct(h, mask), rtol=1e-6)
     mean, var = batch_moments(h, mask)
     torch.testing.assert_close(mean.double(), direct(h, mask).mean, rtol=1e-6, atol=0)

@@ -42,14 +42,14 @@ DENSE = [name for name in CASES if name.startswith(("linear", "conv"))]
 
 
 def falling(width: int) -> Spectrum:
-    """All eigenvectors, each with half the energy of the one before."""
+    """All eigenvectors, each with half the energy of the previous one."""
     return Spectrum(
         2.0 ** -torch.arange(width, dtype=torch.float64), torch.linalg.qr(draw(width, width)).Q
     )
 
 
 def share_of(spectrum: Spectrum, count: int) -> float:
-    """The energy that takes `count` directions."""
+    """The share of energy that `count` directions hold."""
     return max(0.0, (spectrum.values[:count].sum() / spectrum.values.sum()).item() - 1e-9)
 
 
@@ -72,7 +72,7 @@ def test_projecting_twice_is_once_and_nothing_is_lost(
     assert_same(allowed(protection, left), left)
     assert_same(protection.removed(*removed), removed)
     assert_same(minus(minus(update, removed), left), minus(update, update))
-    assert size(left) + size(removed) == pytest.approx(size(update), rel=1e-9)  # at right angles
+    assert size(left) + size(removed) == pytest.approx(size(update), rel=1e-9)  # orthogonal
 
 
 @pytest.mark.parametrize("count", range(8))
@@ -94,7 +94,7 @@ def test_equal_channels_share_their_fate() -> None:
 @pytest.mark.parametrize("strength", [Strength(0.3), Strength(1.0), Strength(0.9, soft=0.1)])
 @pytest.mark.parametrize("shape", [(), (1,), (6,), (1, 1, 6), (6, 1)])
 def test_a_lone_row_keeps_nothing_of_its_update(shape: tuple[int, ...], strength: Strength) -> None:
-    """As a table's rows that are read: there is no direction of it that no question uses."""
+    """Like the rows of a table that are read: questions use every direction of it."""
     update = torch.randn(shape, dtype=torch.float64), None
     left = allowed(protect(lone_row(), strength, update[0]), update)[0]
     assert left.shape == shape and not left.any()
@@ -104,7 +104,7 @@ def test_a_lone_row_keeps_nothing_of_its_update(shape: tuple[int, ...], strength
 
 
 def shrunk(moment: Tensor, update: Tensor, soft: float, trace: Tensor) -> Tensor:
-    """D s (C + s)^-1 by a dense solve, C in shares of `trace`: update [out, d] -> the same."""
+    """D s (C + s)^-1 by a dense solve, with C as shares of `trace`: update [out, d] -> the same."""
     identity = torch.eye(len(moment), dtype=moment.dtype)
     return soft * torch.linalg.solve(moment / trace + soft * identity, update.T).T
 
@@ -117,7 +117,7 @@ def test_soft_equals_a_dense_solve(name: str, soft: float) -> None:
     update = random_update(CASES[name])
     protection = protect(
         decompose(moment), Strength(0.3, soft), update[0]
-    )  # of which the energy is no part
+    )  # the energy does not include them
     expected = shrunk(moment, joined(update), soft, moment.trace())
     torch.testing.assert_close(joined(allowed(protection, update)), expected)
 
@@ -127,7 +127,7 @@ def test_soft_equals_a_dense_solve(name: str, soft: float) -> None:
 def test_soft_leaves_what_is_nearest_to_the_update_and_least_seen(name: str, soft: float) -> None:
     """X = argmin |X - D|^2 + E|X x|^2 / soft over VQA's inputs x, whose mean energy is 1.
 
-    So the soft threshold is a proximal step, as that of `kfac` is, of an update's own effect.
+    So the soft threshold is a proximal step for an update's own effect, as `kfac`'s is.
     """
     module, x = CASES[name].model().map, CASES[name].any()[0]
     moment = second_moment(dense_rows(module, x))
@@ -187,7 +187,7 @@ def test_soft_takes_what_is_stored() -> None:
 
 
 def resolved(moment: Tensor, count: int) -> Spectrum:
-    """The spectrum of which only the leading directions are known, and the energy of the rest."""
+    """The spectrum of which only the leading directions and the energy of the rest are known."""
     whole = decompose(moment)
     assert whole.vectors is not None
     rest = whole.values[count:].mean()
@@ -316,7 +316,7 @@ def test_what_is_removed_is_all_that_is_protected_in_float32(scale: float) -> No
             assert 0 <= some <= 1 + 1e-5 and whole == pytest.approx(1, abs=1e-5)
             assert (
                 energy > 0.9 or 0 <= none < 1e-5
-            )  # where every direction is protected, nothing but rounding is left
+            )  # if every direction is protected, only rounding is left
 
 
 # --- what is refused ------------------------------------------------------------------------------
@@ -328,7 +328,7 @@ def test_what_is_removed_is_all_that_is_protected_in_float32(scale: float) -> No
 def test_a_spectrum_kept_up_to_a_share_serves_that_share_and_none_above(
     base: float, scale: float, width: int
 ) -> None:
-    """Also where the share falls exactly on a direction, and rounding could decide."""
+    """This includes a share that ends exactly on a direction, where rounding could decide."""
     moment, like = (
         scale * torch.diag(base ** torch.arange(width, dtype=torch.float64)),
         torch.zeros(3, width),

@@ -20,7 +20,7 @@ def gradients(seed: int, scale: float = 1.0) -> list[Tensor]:
 def pair(
     seed: int, conflict: bool, g_scale: float = 1.0, a_scale: float = 1.0
 ) -> tuple[list[Tensor], list[Tensor]]:
-    """A task and an anchor gradient whose inner product has the asked sign."""
+    """A task and an anchor gradient whose inner product has the requested sign."""
     gs, as_ = gradients(seed, g_scale), gradients(seed + 1000, a_scale)
     gs[1].fill_(-0.0)  # adding 0 * a would make some of it +0.0
     sign = -1.0 if (projection.inner(gs, as_)[1] < 0) != conflict else 1.0
@@ -28,7 +28,7 @@ def pair(
 
 
 def project(gs: list[Tensor | None], as_: list[Tensor | None]) -> list[Tensor | None]:
-    """What AEGIS makes of a copy of `gs`."""
+    """AEGIS' projection of a copy of `gs`."""
     wg, wa = projection.aegis(*projection.inner(gs, as_))
     return projection.apply(
         [None if g is None else g.clone() for g in gs], as_, float(wg), float(wa)
@@ -55,9 +55,7 @@ def test_projected_gradient_is_orthogonal(seed: int, g_scale: float, a_scale: fl
     projected = project(gs, as_)
     assert before < -1e-3 and cosine(projected, as_).abs() < 1e-6
     removed = [g.double() - p.double() for g, p in zip(gs, projected, strict=True)]
-    assert (
-        cosine(removed, as_) < -1 + 1e-6
-    )  # what went was along the anchor gradient and nothing else
+    assert cosine(removed, as_) < -1 + 1e-6  # only a part along the anchor gradient was removed
 
 
 @pytest.mark.parametrize("g_scale", SCALES)
@@ -123,7 +121,7 @@ def test_tiny_gradients_do_not_underflow() -> None:
     ("dtype", "size"), [(torch.float16, 1e-4), (torch.bfloat16, 1e-37), (torch.float32, 1e-37)]
 )
 def test_weights_beyond_the_gradients_type_are_applied(dtype: torch.dtype, size: float) -> None:
-    """A small anchor gradient has a large weight: so a pass in half precision with a scaler."""
+    """A small anchor gradient has a large weight, as in half-precision passes with a scaler."""
     g = torch.tensor([300.0, 20.0], dtype=dtype)
     a = torch.tensor([-size, 0.0], dtype=dtype)
     weight = float(projection.aegis(*projection.inner([g], [a]))[1])
@@ -136,7 +134,7 @@ def test_weights_beyond_the_gradients_type_are_applied(dtype: torch.dtype, size:
 
 @pytest.mark.parametrize("missing", [True, False])
 def test_weights_that_are_not_read_may_lie_beyond_half_precision(missing: bool) -> None:
-    """Of a float16 gradient on a GPU: a weight of 3e6 made infinite would leave no number."""
+    """For a float16 gradient on a GPU, a weight of 3e6 would become infinite and give NaN."""
     g = torch.tensor([300.0, 20.0], dtype=torch.float16)
     a = torch.tensor([-1e-4, 0.0], dtype=torch.float16)
     weight = projection.aegis(*projection.inner([g], [a]))[1]
@@ -204,7 +202,7 @@ def test_blocks_add_up_to_the_whole(block: int, monkeypatch: pytest.MonkeyPatch)
 def test_few_kernels_find_the_same(
     block: int, scale: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What a GPU computes, computed by the CPU: small tensors are put together."""
+    """What a GPU computes, computed on the CPU: small tensors are concatenated."""
     monkeypatch.setattr(projection, "_BLOCK", block)
     monkeypatch.setattr(projection, "_GPU_BLOCK", block)
     whole: tuple[list[Tensor | None], ...] = (gradients(0, scale), gradients(1))

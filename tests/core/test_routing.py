@@ -22,7 +22,7 @@ def generator(seed: int) -> torch.Generator:
 def site(
     seed: int, experts: int = 0, rank: int = 3, dtype: torch.dtype = torch.float64
 ) -> tuple[RoutedLinear, torch.Generator]:
-    """A map, and that many experts with random B."""
+    """A map, and this many experts with random B."""
     g = generator(seed)
     base = nn.Linear(*WIDTHS).to(dtype)
     with torch.no_grad():
@@ -55,7 +55,7 @@ def test_without_experts_it_is_the_bare_map(seed: int) -> None:
     x = inputs(g)
     bare = made.base(x)
     assert torch.equal(made(x), bare)
-    made.active = 5  # a task that has no router here
+    made.active = 5  # a task without a router here
     assert torch.equal(made(x), bare)
     made.add_router(0, (0, 2), g)
     made.restrict(0, ())
@@ -175,9 +175,9 @@ def test_an_expert_of_weight_zero_changes_nothing_when_it_goes(
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_what_pruning_changes_is_bounded_by_what_is_pruned(seed: int) -> None:
-    """If experts of mass m and terms p_e f_e go, the change is bounded.
+    """If experts with mass m and terms p_e f_e are removed, the change is bounded.
 
-    It is at most m / (1 - m) of what stays, and what goes.
+    It is at most m / (1 - m) times the remaining terms, plus the removed ones.
     """
     made, g = site(seed, experts=4)
     made.add_router(0, range(4), g)
@@ -202,7 +202,7 @@ def test_what_pruning_changes_is_bounded_by_what_is_pruned(seed: int) -> None:
 
 
 def test_a_pruned_map_is_the_map_that_never_had_the_expert() -> None:
-    """Prune, then go on: bit for bit what goes on without."""
+    """Pruning and continuing equals, bit for bit, continuing without the expert."""
     made, g = site(0, experts=3)
     made.add_router(0, range(3), g)
     stir(made, 0, g)
@@ -238,13 +238,13 @@ def test_a_single_expert_needs_no_logits_and_parameters_are_counted() -> None:
     made.add_router(2, (0, 2), g, top=2)
     assert made.count() == 3 * expert + 1 + 10 + 2 * WIDTHS[0] + 1
     del made.routers["2"]
-    made.restrict(1, (1,))  # the others are in no router any more
+    made.restrict(1, (1,))  # no router has the others any more
     assert made.numbers == (1,) and made.count() == expert + 2
     assert [made.add_expert(2, 3, g) for _ in range(3)] == [
         3,
         4,
         5,
-    ]  # a number is never given twice
+    ]  # a number is never reused
 
 
 @pytest.mark.parametrize(("top", "constant"), [(None, False), (2, False), (2, True)])
@@ -290,7 +290,7 @@ def test_the_gradient_of_an_expert_is_scaled_by_its_weight(weight: float) -> Non
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_a_router_over_frozen_experts_moves_inside_their_span_only(seed: int) -> None:
-    """Whatever the loss: a step of the router moves outputs along the columns of the experts' B."""
+    """Whatever the loss, a router's step moves outputs along the columns of the experts' B."""
     made, g = site(seed, experts=2, rank=2)
     router = made.add_router(0, (0, 1), g)
     stir(made, 0, g)

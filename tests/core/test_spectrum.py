@@ -20,7 +20,7 @@ def rows(
     scale: float = 1.0,
     dtype: torch.dtype = torch.float64,
 ) -> Tensor:
-    """Columns of very different size, none of them centred."""
+    """Columns of very different sizes, none of them centred."""
     generator = torch.Generator().manual_seed(seed)
     x = torch.randn(count, width, generator=generator, dtype=torch.float64) + 2
     return (scale * x * 10 ** torch.linspace(0, -2, width, dtype=torch.float64)).to(dtype)
@@ -31,7 +31,7 @@ def random_moment(seed: int, width: int = 7) -> Tensor:
 
 
 def spectra() -> list[Tensor]:
-    """Eigenvalues of all sorts.
+    """Eigenvalues of many kinds.
 
     They are even, or fall slowly or fast; one dwarfs all others, or many lie just above or below
     rounding.
@@ -138,7 +138,7 @@ def test_decompose_keeps_the_fewest_vectors_that_hold_the_energy(energy: float) 
 @pytest.mark.parametrize("bias", [True, False])
 def test_decompose_of_channels_is_each_channels_own(bias: bool) -> None:
     moment = channel_moment(rows(5), bias)
-    spectrum = decompose(moment, energy=0.5)  # all of a channel is stored, whatever the energy
+    spectrum = decompose(moment, energy=0.5)  # channels are stored whole, whatever the energy
     assert spectrum.kind == "elementwise" and spectrum.vectors.shape == moment.shape
     for c, own in enumerate(moment):
         alone = decompose(own)

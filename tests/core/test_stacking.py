@@ -1,4 +1,4 @@
-"""Maps of one shape, treated as one: each gets what it would get by itself."""
+"""Maps of one shape, treated together: each gets the same result as alone."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ pytestmark = pytest.mark.usefixtures("fixed_draws")
 
 OUT = 4
 SHAPES = [(OUT, 5), (OUT, 2, 3, 3)]
-# How many directions each of the maps has, those that were never resolved aside.
+# The number of directions of each map, without those that were never resolved.
 RANKS = [(3,), (2, 5), (5, 1, 3)]
 
 
@@ -64,7 +64,7 @@ def assert_same(found: Sequence[Pair], expected: Sequence[Pair]) -> None:
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("biased", [True, False])
 def test_stacked_curvatures_take_what_each_takes(shape: tuple[int, ...], biased: bool) -> None:
-    """Whether none of them has directions that were never resolved, or one, or all."""
+    """Whether none, one or all of them have directions that were never resolved."""
     size = width(shape, biased)
     for ranks, rests in itertools.product(RANKS, ([0.0] * 3, [0.0, 0.2, 0.0], [0.1, 0.2, 0.3])):
         each = [curved(size, rank, rest) for rank, rest in zip(ranks, rests, strict=False)]
@@ -150,6 +150,6 @@ def test_groups_have_each_site_once_and_one_kind_and_no_more_than_they_may(
         assert len({kind(site) for site in group}) == 1
         assert len(group) == 1 or sum(sizes[site][0] for site in group) <= most
     for a, b in zip(found, found[1:], strict=False):
-        # None is begun before the last one of its kind is full.
+        # No stack begins before the last one of its kind is full.
         if kind(a[0]) == kind(b[0]):
             assert sum(sizes[site][0] for site in (*a, b[0])) > most

@@ -83,7 +83,7 @@ def test_nan_is_not_swallowed() -> None:
 @pytest.mark.parametrize("weighting", ["none", "variance"])
 @pytest.mark.parametrize("widens", [0, 1])
 def test_penalty_is_the_weighted_mean_over_layers(weighting: str, widens: int) -> None:
-    """Of layers of one width, which are compared at once, and of several."""
+    """For layers of one width, which are compared at once, and for several widths."""
     anchor = [Moments(10, *gaussian(i, width=5 + widens * i)) for i in range(3)]
     now = [gaussian(i + 20, width=5 + widens * i) for i in range(3)]
     penalty, w2 = transport_penalty(now, anchor, layer_weights(anchor, weighting))
@@ -121,9 +121,9 @@ def test_penalty_carries_the_graph_and_w2_does_not() -> None:
     ],
 )
 def test_each_token_moves_as_the_closed_form_says(moments_of: MomentsOf) -> None:
-    """dP/dh_t = 2 / (n L) (mean - mean0 + (1 - sigma0 / sigma) (h_t - mean)), and 0 of padding.
+    """dP/dh_t = 2 / (n L) (mean - mean0 + (1 - sigma0 / sigma) (h_t - mean)); 0 at padding.
 
-    However the moments were computed.
+    This holds however the moments were computed.
     """
     generator = torch.Generator().manual_seed(3)
     hidden = [torch.randn(2, 5, 7, dtype=torch.float64, generator=generator) for _ in range(3)]

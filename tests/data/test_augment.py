@@ -9,7 +9,7 @@ from torch import Tensor
 from aegis_cli.data import augment
 from aegis_cli.recipes.policy import AUGMENTATIONS
 
-# The pixel in row 2, column 3 as torchvision 0.28 changes it.
+# The pixel in row 2, column 3 after torchvision 0.28's changes.
 REFERENCE = {
     "brightness": ((1.2,), (0.80309, 0.97051, 0.60076)),
     "contrast": ((0.8,), (0.66194, 0.77356, 0.52706)),

@@ -1,4 +1,4 @@
-"""Demonstrations: what is recorded, and that nothing but the arguments decides the bytes."""
+"""Demonstrations: what is recorded, and that only the arguments determine the bytes."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Spied:
         return self._env.reset(rng, colors)
 
     def step(self, action: np.ndarray) -> Step:
-        self.expert.append(self._env.expert_action())  # at the very state the action is applied to
+        self.expert.append(self._env.expert_action())  # at the state in which the action is applied
         self.executed.append(np.asarray(action))
         return self._env.step(action)
 
@@ -73,11 +73,11 @@ def test_noise_comes_in_bursts_of_the_asked_size() -> None:
     assert 0.4 < on.mean() < 0.6
     assert 0.27 < pushes[on].std() < 0.33
     same = (pushes[1:] == pushes[:-1]).all(axis=1)
-    assert 0.7 < same.mean() < 0.8  # a push lasts
+    assert 0.7 < same.mean() < 0.8  # a push lasts several steps
 
 
 def test_frames_belong_to_their_labels() -> None:
-    """The recorded picture is the one before the action: replaying the episode shows it again."""
+    """The recorded picture is from before the action: replaying the episode shows it again."""
     episode = record_numbered("point", 5, 0.0, ("blue",), 2)
     env = make("point")
     seen = env.reset(episode_rng(5, DEMOS, 2), ("blue",))
@@ -113,7 +113,7 @@ def test_no_held_out_target(recorded: Recorded) -> None:
 
 
 def test_recording_ends_soon_after_arrival() -> None:
-    """Few frames rest at the target: else a policy learns that to rest is what one does."""
+    """Few frames rest at the target; otherwise a policy learns to rest."""
     kept = [record_numbered("reach", 0, 0.3, ("red",), i) for i in range(10)]
     slow = [int((np.linalg.norm(e.actions, axis=1) < 0.1).sum()) for e in kept]
     assert max(slow) <= 4
@@ -125,7 +125,7 @@ def test_same_bytes_from_one_worker_and_two(recorded: Recorded, tmp_path: Path) 
 
 
 def test_no_noise_is_none_with_either_sign(tmp_path: Path) -> None:
-    """NumPy takes -0.0 for a negative deviation."""
+    """NumPy treats -0.0 as a negative deviation."""
     for name, noise in (("plus", 0.0), ("minus", -0.0)):
         demos.run("point", 1, 0, tmp_path / name, noise=noise, workers=1)
     assert (tmp_path / "plus").read_bytes() == (tmp_path / "minus").read_bytes()

@@ -1,4 +1,4 @@
-"""Which episodes `demos.only` names, and what is learned from the others: nothing."""
+"""Which episodes `demos.only` names, and that nothing is learned from the others."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Several sets of demonstrations are one: their frames, their scale, and what has to agree."""
+"""Several sets of demonstrations as one: their frames, their scale, and what has to agree."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def refused(
 
 
 def assert_alike(one: Demonstrations, other: Demonstrations, frames: torch.Tensor) -> None:
-    """Batches of these frames are the same, to the bit."""
+    """Batches of these frames are equal, bit for bit."""
     here, there = one.batch(frames, 4), other.batch(frames, 4)
     assert torch.equal(torch.as_tensor(here.images), torch.as_tensor(there.images))
     assert here.instructions == there.instructions
@@ -113,7 +113,7 @@ def test_a_file_and_a_folder_go_together(demos_file: Path, tmp_path: Path) -> No
 
 
 def test_pictures_of_another_size_are_fitted_into_the_first_sets(tmp_path: Path) -> None:
-    cameras = ("top", "side")  # which have the same sizes, so one warning tells all
+    cameras = ("top", "side")  # with the same sizes, so one warning covers all
     small = save(tmp_path / "small", episodes(3, cameras))
     large = save(tmp_path / "large", episodes(3, cameras, size=(32, 40), seed=1))
     said = list[Event]()
@@ -128,7 +128,7 @@ def test_pictures_of_another_size_are_fitted_into_the_first_sets(tmp_path: Path)
 
 
 def test_frames_that_stay_in_videos_are_joined(tmp_path: Path) -> None:
-    # One camera's frames of noise as they are, and a film of colours.
+    # One camera with plain frames of noise, and a video of colours.
     film = save(tmp_path / "film", episodes(3, smooth=True), as_video=True)
     other = save(tmp_path / "other", episodes(3, seed=1))
     both = mixture.load((film, other), 0.3, 0, cache=False)

@@ -1,4 +1,4 @@
-"""Values far from all others are found by joint, and a training warns of them."""
+"""Values far from all others are found per joint, and a training warns of them."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_of_few_rows_none_is_called_an_outlier() -> None:
 def test_a_training_warns_of_the_joint_and_the_episode(demos_file: Path) -> None:
     loaded = demonstrations.load(demos_file, 0.3, 0)
     found = dataclasses.replace(loaded, train=loaded.read)
-    assert len(found.train) >= 100  # as many as it takes to tell
+    assert len(found.train) >= 100  # as many as a finding requires
     told = list[Event]()
     loading.warn_of_outliers(demos_file, found, Train(), told.append)
     assert told == []
@@ -56,7 +56,7 @@ def test_a_training_warns_of_the_joint_and_the_episode(demos_file: Path) -> None
     found.tensors["actions"][found.train[5], 1] = 1e4
     for settings in (Train(normalization="quantiles"), Train(relative_actions=True)):
         loading.warn_of_outliers(demos_file, found, settings, told.append)
-        assert told == []  # no value shifts these by much; those have a scale of their own
+        assert told == []  # no value shifts these by much; those that do have their own scale
     loading.warn_of_outliers(demos_file, found, RobotTrain(), told.append)
     (warned,) = told
     assert isinstance(warned, Warned)

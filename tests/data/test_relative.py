@@ -1,4 +1,4 @@
-"""Actions relative to the robot's position: which they are, what is learned, what comes out."""
+"""Actions relative to the robot's position: which ones, what is learned, what is predicted."""
 
 from __future__ import annotations
 
@@ -124,7 +124,7 @@ def test_a_policy_learns_actions_less_their_positions_and_adds_these_again(
     noise = plain.draw_noise(len(batch), torch.Generator().manual_seed(1))
     absolute = plain.act_from(*seen, noise)
     assert torch.equal(policy.act_from(*seen, noise), absolute + origins)
-    # So is what a chunk continues, of which the robot has executed some since.
+    # So is the rest of a chunk that is continued after the robot has executed some of it.
     left = absolute[:, 1:] + 0.3
     held = plain.act_from(*seen, noise, Continued(left, 1))
     found = policy.act_from(*seen, noise, Continued(left + origins, 1))
@@ -133,7 +133,7 @@ def test_a_policy_learns_actions_less_their_positions_and_adds_these_again(
 
 
 def test_places_are_no_part_of_the_weights() -> None:
-    """They are in the meta; a file of a policy without them is as it was."""
+    """They are in the meta; a policy's file without them is unchanged."""
     assert relative_policy((0, None)).state_dict().keys() == make_policy().state_dict().keys()
     assert Origins()(torch.zeros(2, 3)) == 0
 
@@ -144,7 +144,7 @@ def test_places_are_no_part_of_the_weights() -> None:
 def test_the_scale_is_of_all_steps_of_the_training_chunks(
     kind: str, most: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of a sample of the frames where there are many."""
+    """If there are many frames, a sample of them is used."""
     monkeypatch.setattr(demonstrations, "_MOST_ROWS", most)
     folder = save(tmp_path / "d", episodes(6), state_names=STATE, action_names=ACTION)
     demos, chunk = demonstrations.load(folder, 0.3, 0), 3
@@ -221,7 +221,7 @@ def test_the_files_of_an_absolute_policy_say_nothing_of_it(
 
 
 def test_targets_for_other_threads_stay_on_the_cpu() -> None:
-    """As the policy goes to a device, which 'meta' stands for."""
+    """The policy itself may go to another device, here 'meta'."""
     policy = make_policy()
     policy.origins = Origins([1, None])
     batch = robot_batch(4)

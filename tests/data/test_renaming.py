@@ -1,4 +1,4 @@
-"""Demonstrations of other names are those of the policy's, once they are renamed."""
+"""Demonstrations with other names equal those with the policy's names once they are renamed."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def test_names_change_places_at_once(known: Path) -> None:
 
 
 def test_the_digest_is_that_of_the_files(known: Path, other: Path) -> None:
-    """A run knows its data again whatever a later command calls its names."""
+    """A run recognises its data whatever names a later command gives it."""
     plain = Selection(OVERHEAD, action="target")
     assert load(other, BACK).sha256 == mixture.digest(other, plain)
     assert mixture.digest(other, Selection("top", rename=BACK)) == mixture.digest(other, plain)
@@ -136,7 +136,7 @@ def test_a_camera_that_was_renamed_is_asked_for_by_the_policys_name(other: Path)
 
 
 def test_sets_that_do_not_agree_are_told_how_to(known: Path, other: Path) -> None:
-    """Of cameras and of joints."""
+    """This applies to cameras and to joints."""
     rename = tuple(pair for pair in BACK if pair[1] != "x")
     assert "demos.rename" in refused((known, other), rename).fix
     one = save(known.parent / "one", episodes(3, ("side",)))

@@ -9,7 +9,7 @@ from aegis_cli.data import spread
 
 
 @given(st.integers(1, 2**40), st.integers(1, 300))
-@example(16_777_220, 100)  # which float32 rounds to a row that is not there
+@example(16_777_220, 100)  # which float32 rounds to a row that does not exist
 @example(27_000_004, 1_000)
 def test_they_go_from_the_first_row_to_the_last(size: int, most: int) -> None:
     rows = spread.rows(size, most)

@@ -1,4 +1,4 @@
-"""The embedded stream: what every task keeps to, and that pictures and words are true."""
+"""The embedded stream: the contract of every task, and that pictures match their words."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def test_the_shipped_encoder_can_read_every_class_in_every_template(name: str) -
 @pytest.mark.parametrize("name", ["colors", "counts", "digits-permuted", "domains", "places"])
 def test_equal_bytes_each_time(name: str, load: Tasks, cache: Path, tmp_path: Path) -> None:
     load(name)
-    embedded.task(name, 32, tmp_path, ignore)  # whatever size is asked for
+    embedded.task(name, 32, tmp_path, ignore)  # whatever size is requested
     assert (tmp_path / f"{name}.safetensors").read_bytes() == (
         cache / f"{name}.safetensors"
     ).read_bytes()
@@ -212,7 +212,7 @@ def test_a_glyph_is_as_tall_as_asked_and_where_asked(character: str) -> None:
 @pytest.mark.parametrize("direction", range(8))
 @pytest.mark.parametrize("outline", [masks.ARROW, masks.DART], ids=["arrow", "dart"])
 def test_a_pointer_points_where_it_says(direction: int, outline: np.ndarray) -> None:
-    """The tip is the outermost point, in that direction on the screen, where y grows downwards."""
+    """The tip is the outermost point, in that direction on the screen, where y points down."""
     points = masks.place(outline, np.zeros(2), 1.0, direction * np.pi / 4)
     tip = points[(outline == [1, 0]).all(1)][0]
     words = names.DIRECTIONS[direction].split()
@@ -222,7 +222,7 @@ def test_a_pointer_points_where_it_says(direction: int, outline: np.ndarray) -> 
 
 @pytest.mark.parametrize("direction", range(8))
 def test_a_pad_lies_where_its_label_says(direction: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The only coloured thing on a grey floor, seen without noise."""
+    """It is the only coloured thing on a grey floor, rendered without noise."""
     rendered = importlib.import_module("aegis_cli.data.streams.rendered")
     monkeypatch.setattr(rendered.Photo, "take", lambda self, picture, rng: photo.to_bytes(picture))
     picture = rendered.pad_place(direction, np.random.default_rng(direction)).astype(float)
@@ -233,7 +233,7 @@ def test_a_pad_lies_where_its_label_says(direction: int, monkeypatch: pytest.Mon
 
 @pytest.mark.parametrize("color", range(8))
 def test_solids_and_targets_have_their_colour(color: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The palette's colour that is nearest in hue to the most saturated pixels."""
+    """The palette's colour whose hue is nearest to that of the most saturated pixels."""
     rendered = importlib.import_module("aegis_cli.data.streams.rendered")
     monkeypatch.setattr(rendered.Photo, "take", lambda self, picture, rng: photo.to_bytes(picture))
     for paint in (rendered.lamplit_solid, rendered.night_target):
@@ -300,9 +300,9 @@ def test_a_caption_is_true_of_pictures_that_have_what_it_says() -> None:
 
 
 def test_every_task_is_named_as_some_caption_names_it() -> None:
-    """Zero-shot is about new pictures, not new words.
+    """Zero-shot accuracy is about new pictures, not new words.
 
-    The permuted names are words too, those of other digits.
+    The permuted names are words too, namely those of other digits.
     """
     told = {opening + text for opening in corpus.OPENINGS for text in corpus.captions().texts}
     for words in names.TASKS.values():
@@ -315,7 +315,7 @@ def test_the_corpus_is_the_same_for_a_seed_and_another_for_another_split() -> No
     other = {image.tobytes() for image in corpus.render(3, 24, "validation").images}
     assert not other & {image.tobytes() for image in first.images}
     said = corpus.captions()
-    assert corpus.true_of(said.says, first.facts).any(1).all()  # there is something to say of each
+    assert corpus.true_of(said.says, first.facts).any(1).all()  # some caption is true of each
 
 
 # --- what is missing ------------------------------------------------------------------------------

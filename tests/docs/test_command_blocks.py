@@ -1,13 +1,13 @@
 """Every command block of the README and of docs/ runs with small settings, or says why not.
 
-It says so in a comment directly before it:
+The reason is in a comment directly before it:
 
     <!-- not run: REASON -->      nothing of the block is tried
     <!-- parsed only: REASON -->  each command reads its options and its recipe, and no more
     <!-- needs: PACKAGE -->       it runs where that package is installed
 
-The blocks of a page run in their order in one folder, so that a block finds what those before it
-have made. Commands run with --json, so that docs/outputs.md can be held to every key they print.
+The blocks of a page run in order in one folder, so a block finds the results of those before it.
+Commands run with --json, so docs/outputs.md can be checked for every key they print.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ Aegis = Callable[..., tuple[int, str, str]]  # words -> exit code, stdout, stder
 
 ALL = [block for page in PAGES for block in tried(page)]
 RUN = [block for block in ALL if block.mark is None]
-# Recipes that name demonstrations of their own, so that a command without any is none to refuse.
+# Recipes that name their own demonstrations, so a command without any is not refused.
 NAMING_DEMOS = ("recipes/paligemma2-libero.yaml",)
 
 
@@ -135,12 +135,12 @@ SMALL_SETTINGS: dict[tuple[str, str], tuple[str, ...]] = {
 
 
 def made_small(words: list[str], backbone: Path) -> list[str]:
-    """The same command on less, with an untrained backbone in the place of the embedded one."""
+    """The same command on less data, with an untrained backbone in place of the embedded one."""
     command, *rest = words
     for option, value in SMALL_OPTIONS.get(command, {}).items():
         rest = with_option(rest, option, value) if not is_stream(rest) else rest
     if "--gate" in rest:
-        rest = with_option(rest, "--max-drop", "100")  # so few questions pass no narrow gate
+        rest = with_option(rest, "--max-drop", "100")  # this few questions pass no narrow gate
     rest = [str(backbone) if word == "embedded" and command != "inspect" else word for word in rest]
     if command == "anchor" and "--backbone" not in rest:
         rest += ["--backbone", str(backbone)]
@@ -148,17 +148,17 @@ def made_small(words: list[str], backbone: Path) -> list[str]:
     if command in ("train", "run", "pretrain") and recipe is not None:
         kind = kind_of(recipe)
         settings = SMALL_SETTINGS.get((command, kind), ())
-        # A block that begins with another run's policy names its backbone itself.
+        # A block that starts from another run's policy names its backbone itself.
         own = any(word.startswith("backbone=runs/") for word in rest)
         settings += (f"backbone={backbone}",) if kind == "policy" and not own else ()
         rest += [word for setting in settings for word in ("--set", setting)]
     elif command == "train":
-        rest += ["--set", "train.steps=5"]  # a run that has ended, which is to take more steps
+        rest += ["--set", "train.steps=5"]  # a finished run that is to take more steps
     return [command, *rest]
 
 
 def with_option(words: list[str], option: str, value: str) -> list[str]:
-    """The words with the option at that value, in its place or at the end."""
+    """The words with the option set to that value, in its place or at the end."""
     if option not in words:
         return [*words, option, value]
     place = words.index(option) + 1
@@ -166,7 +166,7 @@ def with_option(words: list[str], option: str, value: str) -> list[str]:
 
 
 def is_stream(words: list[str]) -> bool:
-    """Whether a command's target is the run of a stream, of which probes take no options."""
+    """Whether a command's target is the run of a stream, for which probes take no options."""
     return any(
         (Path(word) / "recipe.yaml").is_file() and kind_of(f"{word}/recipe.yaml") == "stream"
         for word in words
@@ -174,7 +174,7 @@ def is_stream(words: list[str]) -> bool:
 
 
 def kind_of(recipe: str) -> str:
-    """What the recipe is of, by the keys that only such a recipe has."""
+    """The kind of a recipe, by the keys that only such a recipe has."""
     keys = set(re.findall(r"^(\w+):", Path(recipe).read_text(encoding="utf-8"), re.MULTILINE))
     if "variants" in keys:
         return "study"
@@ -184,14 +184,14 @@ def kind_of(recipe: str) -> str:
 
 
 class Shell:
-    """The few commands that blocks are made of, in this process: others take seconds to start."""
+    """The few commands that blocks consist of, in this process: others take seconds to start."""
 
     def __init__(self, backbone: Path, aegis: Aegis) -> None:
         self.backbone, self.aegis = backbone, aegis
         self.said: list[Any] = []  # the reports of all commands
 
     def run(self, block: Block) -> None:
-        """All commands of the block; those of the environment, `pip` and `pytest`, are left out."""
+        """Run all commands of the block except those for the environment, `pip` and `pytest`."""
         done = 0
         for command in commands(block):
             match command.words:
@@ -217,7 +217,7 @@ class Shell:
         assert done > 0, "nothing of this block is run: mark it"
 
     def parse(self, block: Block) -> None:
-        """Each `aegis` of the block, with something that is refused once its recipe is read."""
+        """Run each `aegis` of the block with something that is refused after its recipe is read."""
         found = [command.words[1:] for command in commands(block) if command.words[0] == "aegis"]
         assert found, "no aegis command in this block: mark it as not run"
         for words in found:
@@ -228,14 +228,14 @@ class Shell:
             )
 
     def read_recipe(self, block: Block) -> None:
-        """The block as a recipe, which has to be a sound one."""
+        """Read the block as a recipe, which must be valid."""
         Path("block.yaml").write_text(block.text, encoding="utf-8")
         code, out, err = self.aegis("inspect", "block.yaml")
         assert code == 0, f"{block.page}:{block.line}\n{out}{err}"
 
 
 def refused_after_reading(words: list[str]) -> tuple[list[str], str]:
-    """The command with one thing that it refuses after reading its recipe, and how it says so.
+    """The command with one thing that it refuses after reading its recipe, and the error's text.
 
     A command without a recipe shows its help instead, which it does only for options that it knows.
     """
@@ -247,9 +247,7 @@ def refused_after_reading(words: list[str]) -> tuple[list[str], str]:
     if command == "train" and kind == "stream":
         return [*words, "--demos", "none"], "--demos"
     if command == "train":
-        if (
-            recipe in NAMING_DEMOS
-        ):  # the model, which is not there either, is the first to be missed
+        if recipe in NAMING_DEMOS:  # its model is missing too, and is reported first
             return words, "no folder 'models/"
         assert "--demos" in rest, words
         while "--demos" in rest:
@@ -265,7 +263,7 @@ def refused_after_reading(words: list[str]) -> tuple[list[str], str]:
 
 
 def given(namespace: Mapping[str, Any]) -> dict[str, Any]:
-    """What a block calls its own and no page makes: an optimizer of the model as it is now."""
+    """What a block takes as given and no page makes: an optimizer of the current model."""
     model = namespace["model"]
     learning = [p for p in model.parameters() if p.requires_grad]
     return {"optimizer": torch.optim.AdamW(learning, lr=1e-3)}
@@ -276,7 +274,7 @@ def given(namespace: Mapping[str, Any]) -> dict[str, Any]:
 
 @pytest.fixture
 def page_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Where a page's blocks run: with the shipped recipes, and without a user's cache."""
+    """The folder in which a page's blocks run: with the shipped recipes, without a user's cache."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("AEGIS_CACHE", str(tmp_path / "cache"))
     (tmp_path / "recipes").symlink_to(ROOT / "recipes")
@@ -317,7 +315,7 @@ def test_the_blocks_of_a_page(
             shell.run(block)
         elif is_run(block) and block.language == "python":
             if "LAYERS).automatic(" in block.text or "guard.callback()" in block.text:
-                # Each example of a trainer begins with the model that was measured.
+                # Each example of a trainer starts with the measured model.
                 namespace |= {"model": measured_paligemma(page_folder)}
             namespace |= given(namespace) if "model" in namespace else {}
             with warnings.catch_warnings():
@@ -332,14 +330,14 @@ def test_the_blocks_of_a_page(
 
 
 def is_run(block: Block) -> bool:
-    """Whether nothing of the block is left out, since what it needs is there."""
+    """Whether the whole block is run, since everything that it needs exists."""
     if block.mark == NEEDS:
         return importlib.util.find_spec(block.reason or "") is not None
     return block.mark is None
 
 
 def own_names(page: str, folder: Path) -> dict[str, Any]:
-    """The names that a page's Python blocks leave to their reader."""
+    """The names that a page's Python blocks leave to the reader."""
     names: dict[str, Any] = {"frame": np.zeros((48, 64, 3), np.uint8), "positions": [0.0] * 6}
     names |= {"robot": ReachArm(), "steps": 3}
     if not any(
@@ -363,7 +361,7 @@ def own_names(page: str, folder: Path) -> dict[str, Any]:
 
 
 def test_a_failed_gate_ends_the_block_for_ci(tmp_path: Path) -> None:
-    """With a stand-in for `aegis` whose probe fails, nothing after the probe runs."""
+    """If a stand-in for `aegis` has a failing probe, nothing after the probe runs."""
     (block,) = [b for b in tried("docs/ci.md") if b.text.startswith("set -e\n")]
     stand_in = tmp_path / "aegis"
     stand_in.write_text('#!/bin/sh\necho "$1" >> calls.txt\ntest "$1" != probe\n')
@@ -381,13 +379,13 @@ def test_a_failed_gate_ends_the_block_for_ci(tmp_path: Path) -> None:
 # Keys below these are names of things: methods, layers, groups, files.
 NAMES_BELOW = {"families", "inputs", "outputs", "seconds", "groups", "memory_mb", "statistics"}
 NAMES_BELOW |= {"trainings", "parts"}
-# What lies below these is somebody else's: a recipe's keys, and what a header says of its kind.
+# Values below these are not ours: a recipe's keys, and a header's facts about its kind.
 OPAQUE = {"recipe", "facts"}
 
 
 @cache
 def documented() -> frozenset[str]:
-    """Every word that docs/outputs.md sets as code."""
+    """Every word that docs/outputs.md formats as code."""
     spans = re.findall(r"`([^`\n]+)`", PAGES["docs/outputs.md"])
     return frozenset(word for span in spans for word in re.findall(r"[\w-]+", span))
 
@@ -402,13 +400,13 @@ def documents(folder: Path) -> Iterator[Any]:
 
 
 def undocumented(reports: list[Any]) -> set[str]:
-    """Their keys that docs/outputs.md does not name, but for names of stages and digests."""
+    """Their keys that docs/outputs.md does not name, except names of stages and digests."""
     found = {key for report in reports for key in keys(report)}
     return {key for key in found if not re.search(r"[/ ]|^[0-9a-f]{64}$", key)} - documented()
 
 
 def keys(value: Any, names: bool = False) -> set[str]:
-    """The keys of nested mappings, but for those that are names, or lie below something opaque."""
+    """The keys of nested mappings, except those that are names, or are below something opaque."""
     if isinstance(value, list):
         return {key for item in value for key in keys(item)}
     if not isinstance(value, dict):

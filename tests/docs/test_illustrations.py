@@ -1,4 +1,4 @@
-"""The drawn pictures of docs/pictures: their script runs, and what is committed came from it."""
+"""The drawn pictures of docs/pictures: their script runs, and its output is what is committed."""
 
 from __future__ import annotations
 

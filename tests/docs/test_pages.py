@@ -1,4 +1,4 @@
-"""What a reader relies on: a short README, links that lead somewhere, and pages that are found."""
+"""What a reader relies on: a short README, links that work, and pages that can be found."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ _FENCE = re.compile(r"^```.*?^```$", re.MULTILINE | re.DOTALL)
 
 
 def links(path: Path) -> list[str]:
-    """Targets of the page's links and pictures that lie in this repository."""
+    """Targets of the page's links and pictures that are in this repository."""
     text = _FENCE.sub("", path.read_text(encoding="utf-8"))
     return [target for target in _LINK.findall(text) if "://" not in target]
 
 
 def anchors(path: Path) -> set[str]:
-    """Where links into a page may lead: its headings in lower case, words joined by '-'."""
+    """Possible targets of links into a page: its headings in lower case, words joined by '-'."""
     text = _FENCE.sub("", path.read_text(encoding="utf-8"))
     headings = re.findall(r"^#+ (.+)$", text, re.MULTILINE)
     return {
@@ -39,7 +39,7 @@ def anchors(path: Path) -> set[str]:
 
 
 def test_a_page_has_no_section_twice() -> None:
-    """A link could lead to one of them alone."""
+    """A link could only lead to one of them."""
     for path in [*LINKING, ROOT / "CHANGELOG.md"]:
         text = _FENCE.sub("", path.read_text(encoding="utf-8"))
         own = re.findall(r"^## .+$", text, re.MULTILINE)
@@ -86,7 +86,7 @@ def test_there_are_links() -> None:
 
 
 def listed(entry: object) -> list[str]:
-    """The pages of a part of the navigation, in their order."""
+    """The pages of a part of the navigation, in order."""
     if isinstance(entry, str):
         return [entry]
     parts = entry.values() if isinstance(entry, dict) else entry
@@ -109,7 +109,7 @@ def test_every_page_is_in_the_navigation() -> None:
     ],
 )
 def test_what_can_be_chosen_has_a_row(page: str, names: tuple[str, ...]) -> None:
-    """Whoever adds one is told that its page is still without it."""
+    """Whoever adds one is told that its page still lacks it."""
     text = (ROOT / "docs" / f"{page}.md").read_text(encoding="utf-8")
     rows = "\n".join(line for line in text.splitlines() if line.startswith("|"))
     assert names

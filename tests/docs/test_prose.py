@@ -1,4 +1,4 @@
-"""Commands, options, recipe keys and files that the pages name in their sentences are there."""
+"""Commands, options, recipe keys and files that the pages name in their sentences exist."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ RECIPES = sorted((ROOT / "recipes").glob("*.yaml"))
 
 
 def spans(page: str) -> list[str]:
-    """What the page's sentences and tables set as code."""
+    """The text that the page's sentences and tables format as code."""
     return re.findall(r"`([^`\n]+)`", FENCE.sub("", PAGES[page]))
 
 

@@ -1,4 +1,4 @@
-"""The table of a published model's runs is made from the cells that lie beside the page."""
+"""The table of a published model's runs is made from the cells beside the page."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_the_pages_table_is_that_of_the_cells(name: str) -> None:
 def test_runs_of_another_number_of_steps_are_no_runs_of_the_folder(
     cell: dict[str, int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Earlier cells, which do not say it, took the usual number."""
+    """Earlier cells, which do not state it, had the usual number."""
     cells = tmp_path / "cells.json"
     cells.write_text(json.dumps({"pretrained": {}, "naive_0.0001_1": cell}))
     steps = "300" if cell else "1200"

@@ -1,6 +1,6 @@
-"""The benchmark times what the commands run, and says so in ratios.
+"""The benchmark times the code that commands run, and reports ratios.
 
-No figure is asserted, only that it is one.
+No value is asserted, only that it is a number.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ def test_every_method_is_compared_with_naive(
         asked.append(recipe.train.method)
         return 2 if recipe.train.method == "naive" else 3
 
-    monkeypatch.setattr(bench, "in_new_process", invented)  # ten processes take long to start
+    monkeypatch.setattr(bench, "in_new_process", invented)  # starting ten processes takes long
     monkeypatch.setattr(bench, "_QUESTIONS", 14)
     report = bench.run(str(tiny_folder), batch_size=2, repeats=1, guard=Guard)
     assert asked == list(METHODS)
@@ -140,7 +140,7 @@ def test_a_step_is_that_of_training(
     chosen = recipe(tiny_folder, method="nullspace")
     bench_runs.save_demos(tmp_path, chosen.task)
     steps = bench_runs.stepper(chosen, anchor_file, tmp_path)
-    assert steps.in_turn == chosen.nullspace.every > 1  # a turn pays for one projection
+    assert steps.in_turn == chosen.nullspace.every > 1  # one projection per turn
     steps.turn(), steps.turn()
     assert [index for index, _ in calls] == list(range(2 * steps.in_turn))
     training = calls[0][1]
@@ -149,7 +149,7 @@ def test_a_step_is_that_of_training(
 
 
 class Invented:
-    """Steps of which each takes `seconds` of a clock, and the clock's machine slows down."""
+    """Steps that each take `seconds` on a clock, on a machine that slows down."""
 
     def __init__(self, name: str, seconds: float, in_turn: int, shared: Shared) -> None:
         self.name, self.seconds, self.in_turn, self.shared = name, seconds, in_turn, shared
@@ -162,7 +162,7 @@ class Invented:
 
 @dataclasses.dataclass
 class Shared:
-    """A clock, how slow its machine has become, and whose steps were taken in which order."""
+    """A clock, the machine's current slowness, and the order in which steps were taken."""
 
     drift: float
     now_s: float = 0.0
@@ -174,7 +174,7 @@ class Shared:
 def test_each_step_is_timed_beside_one_of_the_references(
     drift: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A machine that slows down to a third meanwhile changes no ratio by a thousandth."""
+    """If the machine slows down to a third meanwhile, no ratio changes by a thousandth."""
     shared = Shared(drift)
     monkeypatch.setattr(bench_runs, "time", SimpleNamespace(perf_counter=lambda: shared.now_s))
     naive = Invented("naive", 2.0, 1, shared)
@@ -183,7 +183,7 @@ def test_each_step_is_timed_beside_one_of_the_references(
     step_s, ratios = bench_runs.beside("x", naive, others, 27, events.append)
     assert ratios == pytest.approx({"kfac": 1.05, "odd": 1.5}, rel=1e-3)
     assert drift != 1 or step_s == 2
-    # Whole turns, and no fewer steps than the four of kfac's.
+    # Whole turns, and at least the four steps of kfac.
     pair, back = ["kfac", "naive"], ["naive", "kfac"]
     odd, odd_back = ["odd", "naive"], ["naive", "odd"]
     of_a_round = 2 * (pair + back) + 3 * (odd + odd_back)

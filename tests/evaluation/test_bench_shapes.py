@@ -1,4 +1,4 @@
-"""The benchmark of true shapes, on small ones and in this process."""
+"""The benchmark of real shapes, on small ones and in this process."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ NAME = "smolvlm2-256m"
 
 @pytest.fixture
 def here(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """The small shape, measured in this process; names of what was measured."""
+    """The small shape, measured in this process; returns the names of what was measured."""
     asked: list[str] = []
 
     def in_this_process(_: object, work: Callable[..., Any], *arguments: Any) -> Any:
@@ -59,22 +59,22 @@ def test_each_method_and_each_part_that_it_reads_has_its_costs(here: list[str]) 
     assert list(found.methods) == ["naive", "lora", "aegis", "nullspace"]
     assert list(found.anchor) == ["inputs", "moments"]
     assert [(e.done, e.total) for e in events] == [(i, 6) for i in range(1, 7)]
-    # What an interruption would lose is told as soon as it is known.
+    # What an interruption would lose is reported as soon as it is known.
     assert events[-1].metrics["nullspace s"] == found.methods["nullspace"].step_s
     naive, aegis = found.methods["naive"], found.methods["aegis"]
     assert naive.step_time == naive.peak_memory == 1 and naive.mfu is None
     assert naive.step_s is not None and aegis.step_s is not None
     assert aegis.step_time == aegis.step_s / naive.step_s
-    # The second backward pass goes through the backbone alone.
+    # The second backward pass goes only through the backbone.
     assert aegis.tflop is not None and naive.tflop is not None
     assert 1 < aegis.tflop / naive.tflop < 5 / 3
-    # Of these only nullspace does something between the passes that is timed by itself.
+    # Of these, only nullspace has work between the passes that is timed separately.
     assert naive.own_share is None is aegis.own_share
     constrained = found.methods["nullspace"]
     assert constrained.own_share is not None
     assert 0 < constrained.own_share < constrained.step_time
     assert found.anchor["inputs"].question_s > 0 and found.anchor["inputs"].megabytes > 0
-    assert found.batch_size == 2 and found.tokens == 4 + 7  # an image's, and the words
+    assert found.batch_size == 2 and found.tokens == 4 + 7  # an image's tokens, and the words
     assert found.precision == "float32" and found.clock == "cpu" and found.assumed is None
     assert json.loads(json.dumps(found.to_json()))["methods"]["naive"]["step_time"] == 1
     assert "peak not known" in shown(found) and "CPU seconds" in shown(found)
@@ -146,7 +146,7 @@ def test_mfu_counts_what_training_needs() -> None:
 def test_all_that_a_method_does_between_the_passes_is_timed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """By a clock that these parts alone move, and the passes, which are not of them."""
+    """By a clock that only these parts and the passes advance; the passes do not count."""
     now = [0.0]
 
     def spend(seconds: float, result: Any = None) -> Callable[..., Any]:

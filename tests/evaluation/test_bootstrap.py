@@ -1,4 +1,4 @@
-"""The crossed bootstrap: its ends, what it sees that an interval over seeds does not, coverage."""
+"""The crossed bootstrap: its limits, what an interval over seeds would miss, and its coverage."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ def drawn(
 
 
 def test_units_that_are_all_alike_are_no_certainty_unless_nothing_else_could_come_out() -> None:
-    """Wilson's bound for what was never seen, of the images that differ between the seeds.
+    """Wilson's bound for what was never seen, over the images that differ between the seeds.
 
-    Four questions about an image are one look at it.
+    Four questions about an image count as one observation.
     """
     alike = [Units(np.full(7, 2.0), np.full(7, 4.0), draw, reach=1.0) for draw in (0, 0, 1)]
     bound = wilson_interval(0, 2 * 7)[1]
@@ -45,7 +45,7 @@ def test_units_that_are_all_alike_are_no_certainty_unless_nothing_else_could_com
 
 
 def named(rng: np.random.Generator, seeds: int, asked: int, pool: int) -> list[Units]:
-    """Seeds that are each asked about some images of a file; the images differ in difficulty."""
+    """Seeds that each ask about some images of a file; the images differ in difficulty."""
     hard = rng.normal(size=pool)
     found = []
     for seed in range(seeds):
@@ -57,7 +57,7 @@ def named(rng: np.random.Generator, seeds: int, asked: int, pool: int) -> list[U
 
 
 def test_images_that_seeds_share_are_drawn_once() -> None:
-    """Whatever their order: five looks at the same images are hardly more than one."""
+    """In any order: five observations of the same images are hardly more than one."""
     shared = named(np.random.default_rng(0), seeds=5, asked=40, pool=40)
     apart = [replace(one, names=None) for one in shared]
     one_draw = []
@@ -99,7 +99,7 @@ def test_few_losses_are_told_no_more_sharply_than_none(lost: int) -> None:
 
 @pytest.mark.parametrize("share", (0.001, 0.004, 0.008))
 def test_rare_losses_that_all_seeds_share_are_within_the_interval(share: float) -> None:
-    """Summed over how many of 500 images are lost, which is binomial."""
+    """Summed over the number of lost images among 500, which is binomial."""
     within = 0.0
     for lost in range(20):
         low, high = interval_of_shared_losses(lost)
@@ -163,7 +163,7 @@ def test_the_units_that_seeds_share_widen_it_and_an_interval_over_seeds_does_not
 
 
 def test_it_covers_the_truth_about_as_often_as_it_says() -> None:
-    """Of five seeds and shared images; it is conservative, so that more than 90 % are held."""
+    """For five seeds and shared images; it is conservative, so it covers more than 90 %."""
     rng, held = np.random.default_rng(1), 0
     for _ in range(100):
         low, high = crossed_interval(drawn(rng, seeds=5, units=25, own=0.3, shared=1.0, noise=1.0))

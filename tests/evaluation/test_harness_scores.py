@@ -41,7 +41,7 @@ def rows_of(metrics: Mapping[str, Sequence[Any]]) -> list[dict[str, Any]]:
 
 
 def lmms(folder: Path, task: str, rows: Sequence[Mapping[str, Any]], date: str = DATE) -> Path:
-    """A task's samples in the folder of a model, as lmms-eval lays them out."""
+    """A task's samples in a model's folder, in lmms-eval's layout."""
     path = folder / "models__x" / f"{date}_samples_{task}.jsonl"
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text("".join(json.dumps(row) + "\n" for row in rows))
@@ -57,7 +57,7 @@ def lm_eval(folder: Path, task: str, rows: Sequence[Mapping[str, Any]]) -> Path:
 
 
 def filtered(number: int) -> dict[str, Any]:
-    """A line that names its filter, as that of no answer is named."""
+    """A line with the filter name "none", which stands for no filter."""
     return {"doc_id": number, "filter": "none", "exact_match": 1.0}
 
 
@@ -67,7 +67,7 @@ def heard(events: list[Any]) -> str:
 
 @pytest.fixture
 def two(tmp_path: Path) -> tuple[Path, Path]:
-    """Ten questions of which one is lost."""
+    """Two evaluations of ten questions, one of which is lost."""
     right = [1.0] * 9 + [0.0]
     lmms(tmp_path / "before", "textvqa_val", rows_of({"exact_match": right}))
     lmms(tmp_path / "after", "textvqa_val", rows_of({"exact_match": [0.0, *right[1:]]}))
@@ -139,7 +139,7 @@ def test_both_harnesses_are_read(tmp_path: Path) -> None:
 
 
 def test_several_filters_of_lmms_eval_are_told_by_their_order(tmp_path: Path) -> None:
-    # Its lines do not name the filter: gsm8k has a line of each question for each of the two.
+    # Its lines do not name the filter: gsm8k has a line per question for each of the two.
     right = [1.0, 0.0, 1.0, 0.0]
     strict, flexible = (rows_of({"exact_match": v}) for v in (right, [1.0] * 4))
     lmms(tmp_path / "a", "gsm8k", [*strict, *flexible])
@@ -169,7 +169,7 @@ def test_what_a_task_notes_of_each_question_is_its_score(tmp_path: Path, key: st
     for name in ("a", "b"):
         lmms(tmp_path / name, "pope", rows_of({"pope_accuracy": noted, "pope_recall": noted}))
     (found,) = harness_scores.run(tmp_path / "a", tmp_path / "b").scores
-    # The second one is equal for every question.
+    # The second metric is equal for every question.
     assert (found.metric, found.before) == ("pope_accuracy", pytest.approx(2 / 3))
 
 
@@ -216,7 +216,7 @@ def test_results_that_do_not_say_what_is_better_leave_the_scores(
 def test_a_line_whose_list_of_metrics_is_damaged_is_no_defect(tmp_path: Path, named: Any) -> None:
     for name in ("a", "b"):
         lmms(tmp_path / name, "t", [{**rows_of({"exact_match": [1.0]})[0], "metrics": named}])
-    if named == 5:  # then the line's own keys tell
+    if named == 5:  # then the line's own keys decide
         assert len(harness_scores.run(tmp_path / "a", tmp_path / "b").scores) == 1
     else:
         assert "no question with a score in both" in refused(tmp_path / "a", tmp_path / "b")
@@ -238,9 +238,9 @@ def test_the_newest_evaluation_counts_and_lone_tasks_are_named(two: tuple[Path, 
 def test_no_gate_passes_by_a_task_that_the_second_model_was_not_asked(
     two: tuple[Path, Path],
 ) -> None:
-    """Its evaluation may have ended before it came to that task."""
+    """Its evaluation may have ended before that task."""
     before, after = two
-    lmms(after, "docvqa", rows_of({"anls": [1.0]}))  # only asked of the second: nothing to judge
+    lmms(after, "docvqa", rows_of({"anls": [1.0]}))  # only in the second: nothing to judge
     assert harness_scores.run(before, after, max_drop=50).passed
     lmms(before, "pope", rows_of({"pope_accuracy": [1.0]}))
     assert harness_scores.run(before, after).left_out == ["docvqa", "pope"]
@@ -299,7 +299,7 @@ def test_the_gate_ends_the_command(two: tuple[Path, Path]) -> None:
     lost = ask("--max-drop", "9.9")
     assert lost.exit_code == 1
     assert "textvqa_val (exact_match) dropped more than --max-drop 9.9" in lost.stderr
-    # Ten questions tell the drop to dozens of points.
+    # Ten questions give the drop to within dozens of points.
     unsure = ask("--max-drop", "15", "--gate", "upper", "--json")
     assert unsure.exit_code == 1 and json.loads(unsure.stdout)["passed"] is False
     assert "by the upper end of the drop's interval" in unsure.stderr

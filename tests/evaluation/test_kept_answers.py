@@ -1,4 +1,4 @@
-"""Answers are kept as they come: an interrupted probe goes on, to the same report."""
+"""Answers are kept as they arrive: an interrupted probe resumes and gives the same report."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ BATCH = 4
 
 
 class Stopped(Exception):
-    """What ends a probe halfway."""
+    """Ends a probe halfway."""
 
 
 @pytest.fixture
@@ -48,7 +48,7 @@ def asked(tmp_path: Path) -> VQASet:
 
 @pytest.fixture
 def batches(tiny: EmbeddedVLM, monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """How many questions each pass of `tiny` has had."""
+    """The number of questions in each pass of `tiny`."""
     seen: list[int] = []
     plain = tiny.answers
 
@@ -89,7 +89,7 @@ def store() -> Path:
 def test_an_interrupted_probe_goes_on_to_the_same_answers(
     after: int, ask: Ask, asked: VQASet, batches: list[int], tmp_path: Path
 ) -> None:
-    """As many batches as were answered are not asked again, and no bit differs."""
+    """Batches that were answered are not asked again, and no bit differs."""
 
     def stop(event: Event) -> None:
         if isinstance(event, Progress) and event.done >= after * BATCH:
@@ -165,7 +165,7 @@ def test_another_probe_is_asked(
 def test_nothing_is_kept_for_a_backward_pass(
     ask: Ask, asked: VQASet, tiny: EmbeddedVLM, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A graph of every batch would not fit beside a large model."""
+    """The graphs of all batches would not fit beside a large model."""
     seen: list[bool] = []
     plain = tiny.answers
 
@@ -183,7 +183,7 @@ def test_nothing_is_kept_for_a_backward_pass(
 def test_answers_of_weights_that_nobody_knows_are_not_kept(
     when: str, tmp_path: Path, tiny: EmbeddedVLM, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As where a training writes its next checkpoint while the last one is loaded."""
+    """As when a training writes its next checkpoint while the last one is loaded."""
     for name in ("a", "b"):
         tiny.save(tmp_path / name)
         with torch.no_grad():
@@ -209,7 +209,7 @@ def test_answers_of_weights_that_nobody_knows_are_not_kept(
 def test_people_may_be_graded_by_other_answers(
     ask: Ask, asked: VQASet, batches: list[int], tmp_path: Path
 ) -> None:
-    """What was said is kept, and how right it is follows from the answers that are there now."""
+    """The answers are kept; their scores follow from the reference answers that are there now."""
     before = ask(asked)
     path = tmp_path / "set.jsonl"
     changed = path.read_text().replace('["red", "red", "blue"]', '["red", "red", "red"]')

@@ -1,4 +1,4 @@
-"""Figures beside a run: what Aegis wrote is read, and anything else is one error that names it."""
+"""Figures beside a run: Aegis' own are read, and anything else gives one error that names it."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""The model `aegis` of lmms-eval, with stand-ins for the three classes that lmms-eval lends.
+"""lmms-eval's model `aegis`, with stand-ins for the three classes that lmms-eval provides.
 
-lmms-eval itself is no dependency of the tests: it brings some sixty packages. Its own run of the
+lmms-eval itself is no dependency of the tests: it installs some sixty packages. Its own run of the
 model is in docs/benchmarks.md.
 """
 
@@ -75,7 +75,7 @@ Answers = Callable[..., list[str]]
 
 @pytest.fixture
 def answers(lmms_model: ModuleType) -> Answers:
-    """What the model says to (text, images) pairs, as lmms-eval asks them."""
+    """The model's answers to (text, images) pairs, asked as lmms-eval does."""
 
     def say(
         asked: list[tuple[str, list[Any]]],

@@ -1,4 +1,4 @@
-"""Open-loop errors: what they are on known predictions, and on which episodes they are taken."""
+"""Open-loop errors: their values for known predictions, and the episodes they are taken on."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def test_the_trainings_mean_action_has_a_relative_error_of_one_on_what_was_train
 
 
 def test_an_action_that_rests_in_the_evaluated_frames_weighs_no_more_than_another() -> None:
-    """The error of one held-out episode is in the units of all that was trained on."""
+    """The error of one held-out episode is in units of all training data."""
     shown = recorded()
     actions, _ = shown.chunks(EVERY, CHUNK)
     found = open_loop.compare(shown, EVERY, actions + 0.5, np.array([2.0, 1.0]))
@@ -152,7 +152,7 @@ def test_the_control_rate_is_that_of_the_demonstrations(own_run: Path, demos_fil
         (("dx", "dy"), ("x", "y"), False),
         (("", ""), ("", ""), False),
         ((), (), False),
-        (("axes",), ("axes",), False),  # of which one name stands for all
+        (("axes",), ("axes",), False),  # one name stands for all
         (("a.pos", "a.pos"), ("a.pos", "a.pos"), True),  # of two arms
     ],
 )
@@ -299,13 +299,13 @@ def test_of_other_data_all_episodes_are_taken(naive_run: Path, tmp_path: Path) -
     record.run("reach", 1, 7, tmp_path / "one.safetensors", workers=1)
     found = open_loop.run(naive_run, tmp_path / "one.safetensors")
     assert (found.split, found.episodes, found.trained_on) == (open_loop.OTHER, [0], [])
-    assert found.relative_interval is None  # one episode says nothing of others
+    assert found.relative_interval is None  # one episode says nothing about others
 
 
 def test_episodes_that_an_earlier_run_has_learned_from_are_told(
     naive_run: Path, demos_file: Path, recipe: Recipe, tmp_path: Path
 ) -> None:
-    """Of a run that began with another's policy, and of one that began with that."""
+    """For a run that started with another's policy, and for one that started with that run."""
     other, last = tmp_path / "other.safetensors", naive_run
     record.run("reach", 3, 7, other, workers=1)
     for name in ("second", "third"):
@@ -330,7 +330,7 @@ def test_episodes_that_an_earlier_run_has_learned_from_are_told(
 def test_of_the_runs_own_data_that_has_grown_the_new_episodes_have_to_be_chosen(
     recipe: Recipe, frame_cache: Path, tmp_path: Path
 ) -> None:
-    """Most of all its episodes were trained on, and would flatter the policy."""
+    """Most of its episodes were trained on, and would make the policy look better."""
     made = [dataclasses.replace(e, instruction=lerobot.TEXTS[0]) for e in lerobot.episodes(8)]
     data = lerobot.save(tmp_path / "arm", made[:6])
     train.run(recipe, "naive", data, None, tmp_path / "run")
@@ -364,7 +364,7 @@ def test_episodes_of_which_no_frame_was_read_are_not_reported(
 def test_an_action_that_hardly_varies_beside_its_mean_is_judged_by_how_it_varies(
     recipe: Recipe, demos_file: Path, tmp_path: Path
 ) -> None:
-    """An encoder's ticks, say; the policy only centres it, for its scale would be of rounding."""
+    """For example an encoder's ticks; the policy only centres it, since its scale is rounding."""
     saved = artifacts.load(demos_file, "demos")
     actions = saved.tensors["actions"].clone()
     actions[:, 0] = 5000 + 0.3 * actions[:, 0] / actions[:, 0].std()
@@ -424,7 +424,7 @@ def test_of_a_lerobot_folder_it_is_the_split_of_the_cameras_that_were_trained_on
 def test_data_whose_cameras_are_called_otherwise_wants_them_renamed(
     recipe: Recipe, frame_cache: Path, tmp_path: Path
 ) -> None:
-    """By the option of this command, which chooses no camera."""
+    """With this command's own option, which chooses no camera."""
 
     def recorded_by(*cameras: str) -> Path:
         made = lerobot.episodes(6, cameras=cameras)
@@ -444,7 +444,7 @@ def test_data_whose_cameras_are_called_otherwise_wants_them_renamed(
 def test_only_the_episodes_that_are_asked_for_have_to_be_there(
     recipe: Recipe, frame_cache: Path, tmp_path: Path
 ) -> None:
-    """Also of data that the policy was trained on, of which the recipe names some."""
+    """This includes data on which the policy was trained, of which the recipe names some."""
     made = lerobot.episodes(8, smooth=True, size=(64, 64))
     known = [dataclasses.replace(e, instruction="go to the red pad") for e in made]
     data = lerobot.save(tmp_path / "arm", known)
@@ -495,7 +495,7 @@ def test_an_exported_policy_does_not_say_what_it_was_trained_on(
 def test_of_an_exported_policy_the_episodes_may_be_chosen(
     form: str, naive_run: Path, demos_file: Path, tmp_path: Path
 ) -> None:
-    """Also on the data that it was trained on; which of them it was is not known."""
+    """Even for the data on which it was trained, since the episodes of training are unknown."""
     export.run(naive_run, tmp_path / "policy", form)
     found = open_loop.run(tmp_path / "policy", demos_file, episodes=[6, 2, 6])
     same = open_loop.run(naive_run, demos_file, episodes=[2, 6])
@@ -655,7 +655,7 @@ def test_joints_in_another_order_are_refused(
 def test_another_robot_is_refused_before_any_picture_is_decoded(
     recipe: Recipe, frame_cache: Path, tmp_path: Path
 ) -> None:
-    """To decode a large data set takes hours."""
+    """Decoding a large data set takes hours."""
     made = lerobot.episodes(6)
     known = [dataclasses.replace(e, instruction="go to the red pad") for e in made]
     data = lerobot.save(tmp_path / "arm", known)

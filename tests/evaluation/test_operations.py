@@ -1,4 +1,4 @@
-"""Operations that are counted, against those that the shapes say."""
+"""Counted operations, compared with those that follow from the shapes."""
 
 from __future__ import annotations
 

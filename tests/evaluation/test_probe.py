@@ -49,7 +49,7 @@ def taught(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def broken(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The same VLM with weights drawn anew: all is forgotten."""
+    """The same VLM with new random weights: everything is forgotten."""
     folder = tmp_path_factory.mktemp("broken")
     make_tiny(seed=1).save(folder)
     return folder
@@ -82,7 +82,7 @@ def test_a_backbone_against_itself_drops_nothing(taught: Path, own_anchor: Path)
     report = asked_of(taught, taught, own_anchor, 0.0)
     bound = (
         100 * wilson_interval(0, report.questions)[1]
-    )  # so few questions cannot tell that it is the same
+    )  # this few questions cannot show that it is the same
     assert (report.drop_points, report.passed) == (
         0,
         True,
@@ -127,7 +127,7 @@ def test_a_broken_model_drops_and_drifts(taught: Path, broken: Path, own_anchor:
     )
     assert [x.layer for x in lost.layers] == ["layers.0", "layers.1"]
     for near, far in zip(itself.layers, lost.layers, strict=True):
-        # Other scenes are a small distance away, another model a large one.
+        # Other scenes are close, another model is far away.
         assert 0 <= near.w2 < far.w2 / 3
         assert near.baseline_w2 == far.baseline_w2 == near.w2
 
@@ -213,7 +213,7 @@ def test_a_drift_between_two_sets_of_questions_says_so(
 def test_models_alone_are_compared_without_a_digest_of_their_weights(
     taught: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of billions of weights it takes as long as many answers."""
+    """For billions of weights it takes as long as many answers."""
     monkeypatch.delattr(Backbone, "fingerprint")
     assert asked_of(taught, taught).drop_points == 0
 
@@ -253,7 +253,7 @@ def graded(correct: str) -> list[Graded]:
 def test_the_drops_interval_is_of_paired_differences() -> None:
     """By hand: one of ten lost and none won.
 
-    Of ten images with a question each all ten count: Wilson's intervals are 0.0179 to 0.4042 and
+    With one question per image, all ten images count: Wilson's intervals are 0.0179 to 0.4042 and
     0 to 0.2775.
     """
     report = probe.compare(graded("0111111100"), graded("1111111100"), [], None)
@@ -279,7 +279,7 @@ def test_the_gate(max_drop: float | None, passed: bool | None) -> None:
 
 @pytest.mark.parametrize(("max_drop", "passed"), [(40.4, False), (40.5, True)])
 def test_a_gate_on_the_upper_end_limits_that_of_the_interval(max_drop: float, passed: bool) -> None:
-    """One of ten lost: the drop is 10 points, and the interval ends at 40.42."""
+    """One of ten is lost: the drop is 10 points, and the interval ends at 40.42."""
     before, after = graded("1111111100"), graded("0111111100")
     report = probe.compare(after, before, [], max_drop, gate=UPPER)
     assert report.passed is passed
@@ -288,7 +288,7 @@ def test_a_gate_on_the_upper_end_limits_that_of_the_interval(max_drop: float, pa
 
 @pytest.mark.parametrize(("lost", "passed"), [(20, True), (21, False)])
 def test_a_drop_exactly_on_the_gates_border_passes(lost: int, passed: bool) -> None:
-    """20 of 2000 are 1 point, whatever a float says."""
+    """20 of 2000 are 1 point, whatever floating point says."""
     report = probe.compare(graded("0" * lost + "1" * (2000 - lost)), graded("1" * 2000), [], 1.0)
     assert report.drop_points > 1.0 and report.passed is passed
 
@@ -302,7 +302,7 @@ def test_a_drop_exactly_on_the_gates_border_passes(lost: int, passed: bool) -> N
         ("1" * 40, "1" * 40, 5.0, True),
         ("1" * 40, "1" * 40, 20.0, False),
         ("1" * 40, "0" * 40, 5.0, False),  # far past the gate
-        ("1" * 40, "1" * 40, 0.0, False),  # no number of questions would do
+        ("1" * 40, "1" * 40, 0.0, False),  # no number of questions would suffice
         ("1" * 40, "1" * 40, None, False),
     ],
 )
@@ -339,7 +339,7 @@ def test_a_run_is_compared_with_the_model_it_began_from(
     aegis, naive_run: Path, anchor_file: Path, recipe: Recipe, tmp_path: Path
 ) -> None:
     run = tmp_path / "run"
-    shutil.copytree(naive_run, run, symlinks=True)  # what is measured is kept in it
+    shutil.copytree(naive_run, run, symlinks=True)  # since measurements are kept in it
     asked = ("--questions", 30, "--json")
     ways = [("--max-drop", 100), ("--anchor", anchor_file), ("--baseline", recipe.backbone)]
     found = []
@@ -469,7 +469,7 @@ def test_a_baseline_that_the_run_did_not_begin_from_is_told(
 def test_a_run_that_begins_with_another_run_is_held_against_the_vlm(
     taught: Path, demos_file: Path, tmp_path: Path, aegis: Any
 ) -> None:
-    """The model that it began from has lost already what the first run has cost."""
+    """The model from which it started has already lost what the first run cost."""
     first, second = tmp_path / "first", tmp_path / "second"
     train.run(recipe(taught), "naive", demos_file, None, first)
     train.run(recipe(first), "stop-gradient", demos_file, None, second)

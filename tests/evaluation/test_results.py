@@ -1,4 +1,4 @@
-"""Measurements in a run's folder: kept whole, read back, apart from those of `aegis run`."""
+"""Measurements in a run's folder: kept complete, read back, separate from those of `aegis run`."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def test_a_rollout_that_was_repeated_is_told_once_as_it_was_found_last(run: Path
         ({"seed": 0, "ensemble": 0.01}, {}, ("no ensemble", "ensemble 0.01")),
         ({"seed": 0, "delay": 2, "guided": False}, {}, ("no delay", "delay 2")),
         ({"seed": 0, "delay": 0, "guided": True}, {}, ("no delay", "delay 0, guided")),
-        ({"seed": 0}, {"episodes": 8}, ("", "")),  # which the tables have anyway
+        ({"seed": 0}, {"episodes": 8}, ("", "")),  # which the tables show anyway
     ],
 )
 def test_a_rollout_that_was_played_otherwise_says_how(
@@ -95,7 +95,7 @@ def test_a_rollout_that_was_played_otherwise_says_how(
 
 
 def probe_of(drop: float | None, passed: bool | None = None, drift: bool = False):
-    """A probe that tells its drop, its gate's verdict and its drift, or not."""
+    """A probe with or without its drop, its gate's verdict and its drift."""
     layers = [{"layer": "layers.0", "w2": 12.5}] if drift else []
     return probe("shape") | {"drop_points": drop, "passed": passed, "layers": layers}
 
@@ -256,7 +256,7 @@ def test_nothing_is_kept_in_a_folder_that_may_not_be_written_to(run: Path) -> No
 
 
 def test_two_processes_do_not_write_at_once(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """And what could not be kept was measured all the same."""
+    """And if a result could not be kept, it was measured nevertheless."""
     monkeypatch.setattr(results, "_PATIENCE_S", 0.0)
     told: list[Event] = []
     with locks.alone(run / "results"):
@@ -301,7 +301,7 @@ def test_a_gate_passes_if_every_probe_does() -> None:
 
 
 def test_what_the_recipe_no_longer_asks_for_is_no_result(run: Path) -> None:
-    """A job whose recipe has fewer question sets and colours leaves the earlier files there."""
+    """If a job's recipe then has fewer question sets and colours, earlier files remain."""
     files.save_json(run / "probe-2.json", probe("shape", 1))
     assert len(results.probes(run)) == 1 and len(results.rollouts(run)) == 2
     recipe = results.recipe_of(run)

@@ -1,6 +1,6 @@
-"""Closed loop: known policies have known success, and equal runs equal results.
+"""Closed loop: known policies have known success, and equal runs give equal results.
 
-No episode is a demonstration's.
+No episode equals a demonstration.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ Decide = Callable[["Seen"], np.ndarray]
 
 
 class Seen:
-    """An environment that remembers what there was to see, whether it was looked at or not."""
+    """An environment that records what could be seen, whether or not it was rendered."""
 
     def __init__(self, env: Any) -> None:
         self.env, self.spec = env, env.spec
@@ -87,7 +87,7 @@ class Puppet:
         return self
 
     def fingerprint(self) -> str:
-        return str(id(self))  # nobody else decides as it does
+        return str(id(self))  # unlike that of any other policy
 
     def act(
         self,
@@ -123,7 +123,7 @@ def to_a_distractor(seen: Seen) -> np.ndarray:
 
 @pytest.fixture
 def puppet(envs: list[Seen], monkeypatch: pytest.MonkeyPatch) -> Callable[..., Puppet]:
-    """Put a puppet in the place of every trained policy."""
+    """Replace every trained policy with a puppet."""
 
     def install(decide: Decide, task: str = "point", chunk: int = 1) -> Puppet:
         policy = Puppet(envs, decide, chunk)
@@ -192,7 +192,7 @@ def test_successes_are_told_by_colour_and_by_instruction(
 def test_successes_are_told_by_suite(
     puppet: Callable[..., Puppet], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of a set as large as LIBERO's four suites: every third episode is of the second suite."""
+    """For a set as large as LIBERO's four suites: every third episode is of the second suite."""
     members = {"point": ("a", "b", "c"), "one": ("a", "c"), "two": ("b",)}
     monkeypatch.setattr(sim, "members", members.__getitem__)
     monkeypatch.setattr(sim, "suites", lambda _: ("one", "two"))
@@ -239,7 +239,7 @@ def test_an_ensemble_executes_the_mean_of_what_was_predicted(
     envs: list[Seen],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Each of several episodes by a naive sum over ACT's weights, one prediction a step."""
+    """Several episodes, each compared with a plain sum of ACT's weights, one prediction a step."""
     chunk, predicted, executed = 3, list[np.ndarray](), dict[int, list[np.ndarray]]()
     draws = np.random.default_rng(0)
     policy = puppet(rest, chunk=chunk)
@@ -271,7 +271,7 @@ def test_an_ensemble_executes_the_mean_of_what_was_predicted(
 def test_the_change_of_the_actions_is_that_of_what_is_executed(
     far: float, change: float, puppet: Callable[..., Puppet], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of a policy that turns back at every step, in one of two dimensions; 1 is a full action."""
+    """For a policy that reverses at every step in one of two dimensions; 1 is a full action."""
     policy = puppet(rest, chunk=2)
     turns = np.array([[far, 0.1], [-far, 0.1]], np.float32)
     monkeypatch.setattr(policy, "act", lambda images, *_: torch.from_numpy(turns)[None])
@@ -295,7 +295,7 @@ def test_a_replan_that_is_asked_for_executes_chunks_as_they_are(
 def test_pictures_are_shown_in_the_sizes_of_training(
     known: bool, puppet: Callable[..., Puppet], envs: list[Seen], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As `load_policy` and `aegis evaluate` show them; as the task draws them if none is known."""
+    """As in `load_policy` and `aegis evaluate`; in the task's own size if none is known."""
     policy, shown = puppet(rest, chunk=40), list[np.ndarray]()
 
     def act(images: torch.Tensor, *_: Any) -> torch.Tensor:
@@ -321,7 +321,7 @@ def test_while_a_delayed_chunk_is_predicted_the_one_before_is_executed(
     envs: list[Seen],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Each of several episodes, one of which ends before the others."""
+    """This holds for each of several episodes, one of which ends before the others."""
     horizon, predicted = 9, list[np.ndarray]()
     told, executed = list[Continued | None](), dict[int, list[np.ndarray]]()
     draws = np.random.default_rng(0)
@@ -349,7 +349,7 @@ def test_while_a_delayed_chunk_is_predicted_the_one_before_is_executed(
     for number, actions in executed.items():
         for at, found in enumerate(actions):
             asked, into = divmod(at, replan)
-            late = asked > 0 and into < delay  # the chunk before goes on
+            late = asked > 0 and into < delay  # the previous chunk continues
             rows = [3 if turn * replan < 20 else 2 for turn in range(len(predicted))]
             chunk = predicted[asked - late]
             row = number if rows[asked - late] == 3 or number == 0 else 1
@@ -358,7 +358,7 @@ def test_while_a_delayed_chunk_is_predicted_the_one_before_is_executed(
     assert told[0] is None and all((one is not None) == guided for one in told[1:])
     for one, before in zip(told[1:], predicted, strict=False):
         if one is not None and len(one.actions) == len(before):
-            # What is left of the chunk before, and nothing of what was executed.
+            # The rest of the previous chunk, without what was executed.
             assert one.delay == delay
             np.testing.assert_array_equal(one.actions, before[:, replan:])
 
@@ -395,7 +395,7 @@ def test_progress_and_more_episodes_than_one_group(
     assert done == sorted(done) and done[-1] == 5 * longest and report.success >= 4 / 5
     assert 0 < done[0] <= 2 * 4 and {2 * longest, 4 * longest} < set(
         done
-    )  # a chunk of each episode; what ends early is done
+    )  # one chunk per episode; an episode that ends early is done
     assert {(e.stage, e.total, e.unit) for e in events} == {
         ("rollout held-out", 5 * longest, "steps")
     }
@@ -448,7 +448,7 @@ def test_episodes_are_the_same_for_every_policy_and_number(
 
 def test_the_same_run_twice_gives_the_same_result(run_folder: Path, envs: list[Seen]) -> None:
     first = rollout.run(run_folder, "reach", 3, "seen")
-    shutil.rmtree(cache.folder("episodes"))  # or the second would be the first
+    shutil.rmtree(cache.folder("episodes"))  # otherwise the second would be the first
     second = rollout.run(run_folder, None, 3, "seen")
     assert timeless(first) == timeless(second) and first.episodes_per_s > 0
     paths = [[s.proprio.tobytes() for s in env.shown] for env in envs]
@@ -459,7 +459,7 @@ def test_the_same_run_twice_gives_the_same_result(run_folder: Path, envs: list[S
 def test_an_interrupted_rollout_goes_on_to_the_same_report(
     groups: int, run_folder: Path, envs: list[Seen], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """After the groups of episodes that were played; the others are played as ever."""
+    """It resumes after the groups of episodes that were played; the others are played as usual."""
     monkeypatch.setattr(sim, "lockstep", lambda _: 2)
 
     class Stopped(Exception):
@@ -481,7 +481,7 @@ def test_an_interrupted_rollout_goes_on_to_the_same_report(
     del envs[:]
     again = rollout.run(run_folder, None, 5, "seen")
     assert envs == [] and timeless(again) == timeless(resumed)
-    assert again.episodes_per_s < 1000  # as fast as they were played, and not as they were found
+    assert again.episodes_per_s < 1000  # the speed of playing, not of finding
     shutil.rmtree(cache.folder("episodes"))
     assert timeless(rollout.run(run_folder, None, 5, "seen")) == timeless(resumed)
 
@@ -489,7 +489,7 @@ def test_an_interrupted_rollout_goes_on_to_the_same_report(
 def test_what_was_played_otherwise_is_played_again(
     run_folder: Path, envs: list[Seen], tmp_path: Path
 ) -> None:
-    """In other colours or paces, of another number at once, or to be filmed."""
+    """With other colours or another pace, with another number at once, or for a video."""
     rollout.run(run_folder, None, 2, "seen")
     options: list[dict[str, Any]] = [
         {"colors": "held-out"},
@@ -509,7 +509,7 @@ def test_what_was_played_otherwise_is_played_again(
 def test_several_processes_play_the_same_episodes(
     run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """To the bytes of the video."""
+    """Down to the bytes of the video."""
     alone = rollout.run(run_folder, None, 3, "seen", tmp_path / "v.mp4")
     shutil.rmtree(cache.folder("episodes"))
     film = (tmp_path / "v.mp4").read_bytes()
@@ -522,7 +522,7 @@ def test_several_processes_play_the_same_episodes(
 def test_no_picture_of_an_episode_that_is_over_is_held(
     puppet: Callable[..., Puppet], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Thousands of episodes have large ones."""
+    """Pictures may be large, and there may be thousands of episodes."""
     puppet(rest, chunk=40)
     held: list[Any] = []
     measured = acting._measured
@@ -535,14 +535,14 @@ def test_no_picture_of_an_episode_that_is_over_is_held(
     rollout.run(Path("any"), None, 3, "seen")
     assert len(held) == 3
     for episode in held:
-        json.dumps(dataclasses.asdict(episode))  # of plain values, without an array among them
+        json.dumps(dataclasses.asdict(episode))  # plain values only, without an array
 
 
 @pytest.mark.parametrize(("rate", "warnings"), [(None, 0), (10.0, 0), (30.0, 1)])
 def test_steps_of_another_length_than_the_trainings_are_warned_of(
     rate: float | None, warnings: int, run_folder: Path
 ) -> None:
-    """Which only a policy can have that was trained in no task."""
+    """This can only happen for a policy that was trained for no task."""
     assert sim.make("reach").spec.control_hz == 10.0
 
     def load(folder: Path, task: str | None) -> rollout.Acting:
@@ -616,11 +616,11 @@ def test_the_table_is_for_people(aegis, run_folder: Path) -> None:
 # --- videos --------------------------------------------------------------------------------------
 
 
-CELL, LINE, LEFT, TOP = 288, 296, 10, 26  # a video's tiles, and where their pictures begin
+CELL, LINE, LEFT, TOP = 288, 296, 10, 26  # a video's tiles, and the origin of their pictures
 
 
 def picture_in(frame: np.ndarray, column: int) -> np.ndarray:
-    """What a policy saw, out of a tile of a video's frame; the note and the ring are on it."""
+    """What a policy saw, cut from a tile of a video's frame; the note and the ring are on it."""
     left = LEFT + column * CELL
     return frame[TOP + 2 : TOP + 256 : 4, left + 2 : left + 256 : 4]
 
@@ -717,7 +717,7 @@ def test_the_ring_is_where_the_picture_shows_the_target(task: str) -> None:
         assert (
             np.abs(hue - np.array(RGB[env.target_color]) / max(RGB[env.target_color])).max() < 0.2
         )
-        assert np.abs(outside - found).max(axis=-1).min() > 20  # it is the one place of its colour
+        assert np.abs(outside - found).max(axis=-1).min() > 20  # no other place has its colour
 
 
 # --- what is refused -----------------------------------------------------------------------------

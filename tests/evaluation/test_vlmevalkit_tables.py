@@ -46,7 +46,7 @@ def asked(count: int, first: int = 0) -> list[Row]:
 
 
 def judged(verdicts: Sequence[Any], column: str = "hit", **more: Sequence[Any]) -> list[Row]:
-    """The same with what a judge appends."""
+    """The same rows with the columns that a judge appends."""
     added = {column: verdicts, **more}
     return [
         {**row, **{name: values[number] for name, values in added.items()}}
@@ -55,7 +55,7 @@ def judged(verdicts: Sequence[Any], column: str = "hit", **more: Sequence[Any]) 
 
 
 def write(path: Path, rows: Sequence[Mapping[str, Any]]) -> Path:
-    """A table as pandas writes one, by the end of its name."""
+    """A table as pandas writes it, in the format of its suffix."""
     path.parent.mkdir(parents=True, exist_ok=True)
     names = list(rows[0]) if rows else ["index", "prediction", "hit"]
     cells = [[row[name] for name in names] for row in rows]
@@ -81,7 +81,7 @@ def evaluation(
     suffix: str = ".tsv",
     run: str = RUN,
 ) -> Path:
-    """What one evaluation leaves in a model's folder: predictions, verdicts, a summary."""
+    """The files of one evaluation in a model's folder: predictions, verdicts, a summary."""
     folder = model / run
     begin = f"{model.name}_{benchmark}"
     predictions = [
@@ -115,7 +115,7 @@ def refused(before: Path, after: Path, max_drop: float | None = None) -> str:
 
 @pytest.fixture
 def two(tmp_path: Path) -> tuple[Path, Path]:
-    """Ten questions of which one is lost."""
+    """Two evaluations of ten questions, one of which is lost."""
     evaluation(tmp_path / "base", "MMStar", judged([1] * 9 + [0]))
     evaluation(tmp_path / "tuned", "MMStar", judged([0] + [1] * 8 + [0]))
     return tmp_path / "base", tmp_path / "tuned"
@@ -163,7 +163,7 @@ def test_drop_and_interval_are_those_computed_by_hand(two: tuple[Path, Path]) ->
         (0.1 + z**2 / (2 * n)) / (1 + z**2 / n),
         z * math.sqrt(0.1 * 0.9 / n + z**2 / (4 * n**2)) / (1 + z**2 / n),
     )
-    most_won = z**2 / n / (1 + z**2 / n)  # Wilson's upper end of none of ten
+    most_won = z**2 / n / (1 + z**2 / n)  # Wilson's upper end for none of ten
     low = 0.1 - math.hypot(0.1 - (middle - half), most_won)
     assert found.drop_interval == pytest.approx((100 * low, 100 * (middle + half)), abs=1e-3)
 
@@ -214,7 +214,7 @@ def test_truth_values_are_verdicts(tmp_path: Path, suffix: str) -> None:
         ("TextVQA_VAL", [[1, 0.3333333333333333, 1], [0.0, 0.0, 0.0]], [7 / 9, 0.0]),
         ("GQA_TestDev_Balanced", [[1.0], [0.0]], [1.0, 0.0]),
         ("ChartQA_TEST", [[True, False], [False, False]], [1.0, 0.0]),
-        # Distances: the nearest reference counts, and nothing that is farther than a half.
+        # Distances: the nearest reference counts, and distances above a half count as 0.
         ("DocVQA_VAL", [[0.9, 0.2], [0.6, 0.51]], [0.8, 0.0]),
         ("InfoVQA_VAL", [[0.5, 1.0], [0.0]], [0.5, 1.0]),
     ],
@@ -228,7 +228,7 @@ def test_matches_count_as_vlmevalkit_counts_them(
 ) -> None:
     means = [sum(own) / len(own) for own in matches]
     for name, shown in (("a", matches), ("b", matches[::-1])):
-        # `eval_score` of DocVQA is a mean of distances, and no score.
+        # `eval_score` of DocVQA is a mean of distances, not a score.
         rows = judged(shown, "eval_match", eval_score=means)
         evaluation(tmp_path / name, benchmark, rows, "results", suffix)
     (found,) = harness_scores.run(tmp_path / "a", tmp_path / "b").scores
@@ -237,7 +237,7 @@ def test_matches_count_as_vlmevalkit_counts_them(
 
 
 def test_a_fall_of_docvqa_is_a_drop(tmp_path: Path) -> None:
-    """Its matches are distances, so that they rise where the answers become worse."""
+    """Its matches are distances, so they rise if the answers become worse."""
     for name, distance in (("a", 0.0), ("b", 1.0)):
         rows = judged([[distance]] * 20, "eval_match", eval_score=[distance] * 20)
         evaluation(tmp_path / name, "DocVQA_VAL", rows, "results")
@@ -246,7 +246,7 @@ def test_a_fall_of_docvqa_is_a_drop(tmp_path: Path) -> None:
 
 
 def widths(folder: Path, benchmark: str, rows: Callable[[Sequence[int]], list[Row]]) -> float:
-    """How wide the interval is, where every second of 40 questions with its next one is lost."""
+    """The interval's width if of 40 questions every second pair of neighbours is lost."""
     lost = [0 if number // 2 % 2 else 1 for number in range(40)]
     evaluation(folder / "a", benchmark, rows([1] * 40))
     evaluation(folder / "b", benchmark, rows(lost))
@@ -256,7 +256,7 @@ def widths(folder: Path, benchmark: str, rows: Callable[[Sequence[int]], list[Ro
 
 
 def test_one_question_in_several_orders_is_not_several(tmp_path: Path) -> None:
-    """A circular benchmark asks again with 1e6 added to the index."""
+    """A circular benchmark asks again, with 1e6 added to the index."""
 
     def circular(verdicts: Sequence[int]) -> list[Row]:
         return [
@@ -297,7 +297,7 @@ def test_a_folder_a_run_and_a_table_are_taken(two: tuple[Path, Path]) -> None:
         (two[0] / path.name).symlink_to(path.relative_to(two[0]))
     events: list[Any] = []
     expected = harness_scores.run(*two, on_event=events.append).scores
-    assert heard(events) == ""  # a link is no second evaluation
+    assert heard(events) == ""  # a link is not a second evaluation
     assert harness_scores.run(two[0] / RUN, two[1] / RUN).scores == expected
     assert harness_scores.run(table_of(two[0] / RUN), table_of(two[1])).scores == expected
 
@@ -347,7 +347,7 @@ def test_what_is_not_noted_of_each_question_is_left_out_with_the_reason(
 
 
 def test_a_benchmarks_own_score_is_no_verdict(two: tuple[Path, Path]) -> None:
-    """What stands before the prediction was there before anything was judged."""
+    """Columns before the prediction existed before anything was judged."""
     for model in two:
         rows = [{"score": 0.5, **row} for row in asked(3)]
         write(model / RUN / f"{model.name}_MathVista.tsv", rows)
@@ -374,7 +374,7 @@ def test_a_judge_of_one_model_alone_is_told(two: tuple[Path, Path]) -> None:
 
 
 def test_tables_of_two_benchmarks_are_not_taken_for_one(two: tuple[Path, Path]) -> None:
-    """Without predictions of its own, a table goes with those whose name its own begins with."""
+    """A table without its own predictions belongs to those whose name is a prefix of its name."""
     for model in two:
         rows = [{**row, "question": "Quite another?"} for row in judged([1] * 10)]
         evaluation(model, "MMStar_V2", rows)
@@ -387,7 +387,7 @@ def test_no_gate_passes_by_verdicts_that_the_second_model_has_not_got(
 ) -> None:
     for model in two:
         evaluation(model, "POPE", judged([True], "score"), "auxmatch")
-    table_of(two[1]).unlink()  # the evaluation ended before it judged these
+    table_of(two[1]).unlink()  # the evaluation ended before it judged them
     assert harness_scores.run(*two).left_out == ["MMStar"]
     assert "no scores in" in refused(*two, max_drop=50)
 
@@ -422,7 +422,7 @@ def test_reading_is_told_to_its_end(two: tuple[Path, Path], monkeypatch: Any) ->
 @pytest.mark.parametrize("suffix", tables.SUFFIXES)
 def test_a_blank_verdict_is_refused(tmp_path: Path, blank: Any, suffix: str) -> None:
     if blank is not None and suffix == ".xlsx" and blank != blank:
-        blank = None  # a workbook has no other way to write it
+        blank = None  # a workbook has no other way to store it
     for name in ("a", "b"):
         rows = judged([1, 0, blank if name == "b" else 1])
         path = evaluation(tmp_path / name, "MMStar", rows, suffix=suffix)
@@ -573,7 +573,7 @@ def test_an_index_of_any_length_is_taken(tmp_path: Path) -> None:
 
 
 def test_a_workbook_without_styles_is_read(two: tuple[Path, Path]) -> None:
-    """Whoever writes none makes openpyxl warn, which is no damage."""
+    """If a file has none, openpyxl warns, but this is not damage."""
     evaluation(two[0], "MMStar", judged([1] * 10), suffix=".xlsx")
     for path in two[0].rglob("*.tsv"):
         path.unlink()
@@ -588,7 +588,7 @@ def test_a_workbook_without_styles_is_read(two: tuple[Path, Path]) -> None:
 
 @pytest.mark.parametrize("suffix", (".xlsx", ".tsv"))
 def test_empty_rows_and_long_cells_are_taken(tmp_path: Path, suffix: str) -> None:
-    length = 200_000 if suffix == ".tsv" else 32_000  # as long as a cell of a workbook may be
+    length = 200_000 if suffix == ".tsv" else 32_000  # the maximum length of a workbook's cell
     for name in ("a", "b"):
         rows = judged([1, 0, 1])
         rows[0]["prediction"] = "A" * length

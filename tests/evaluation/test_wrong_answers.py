@@ -23,7 +23,7 @@ def graded(families: str) -> list[Graded]:
 
 
 def asked(count: int, side: int = 4) -> VQASet:
-    """As many images, the n-th of the grey n."""
+    """Questions about this many images; the n-th is of the grey n."""
     images = np.arange(count, dtype=np.uint8)[:, None, None, None] + np.zeros((1, side, side, 3))
     return VQASet(images.astype(np.uint8), np.arange(count), ())
 

@@ -1,4 +1,4 @@
-"""The guard's backward pass in a plain loop, against gradients taken one by one and training."""
+"""The guard's backward pass in a plain loop, against separate gradients and `aegis train`."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def test_equal_to_training_step_for_step(
 ) -> None:
     """A plain loop with the guard beside `aegis train`'s own steps, in float64.
 
-    Both begin alike and are settled at the end.
+    Both start alike and are settled at the end.
     """
     section = {"aegis": Options, "nullspace": Nullspace, "kfac": Kfac}[method](**options)
     settings = dataclasses.replace(recipe.train, method=method)
@@ -137,7 +137,7 @@ def frames_of(run: assemble.TrainingRun) -> Iterator[Any]:
 
 
 def plain_loop(run: assemble.TrainingRun, guard: Guard) -> None:
-    """What a user would write with our parts: `aegis train`'s loop, but for the guard."""
+    """The loop that a user would write with our parts: `aegis train`'s, except for the guard."""
     policy, settings = run.policy.train(), run.recipe.train
     (optimizer,) = run.optimizers
     for index, frames in enumerate(frames_of(run)):
@@ -170,7 +170,7 @@ def read_anchor(path: Path) -> Anchor:
 def separate(
     model: nn.Module, anchor: Anchor, seeds: list[int]
 ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """Summed task gradients and mean anchor gradients of some batches, a graph for each."""
+    """Summed task gradients and mean anchor gradients of some batches, with a graph for each."""
     named = dict(model.named_parameters())
     wanted = [merge(i, t) for i, t in zip(anchor.image, anchor.text, strict=True)]
     task, pull = ({name: torch.zeros_like(p) for name, p in named.items()} for _ in range(2))
@@ -253,7 +253,7 @@ def test_the_sum_of_gradients_is_projected(seeds: list[int], block: str, anchor:
 
 
 def alone(model: nn.Module, anchor: Path, seed: int) -> tuple[Tensor, ...]:
-    """W2^2 of each layer of one batch."""
+    """W2^2 of each layer for one batch."""
     other = copy.deepcopy(model)
     other.zero_grad()
     guard = Guard(other, anchor, LAYERS)
@@ -280,7 +280,7 @@ def test_restoration_does_not_grow_with_the_number_of_micro_batches(anchor: Path
 def test_what_the_task_never_reaches_has_no_gradient_where_the_sum_has_no_conflict(
     anchor: Path,
 ) -> None:
-    """Though the sum of an earlier pass had one, and its projection moved such parameters."""
+    """This holds though the sum of an earlier pass had one, which the projection changed."""
     grads = []
     for scales in ((1.0,), (-1.0, 2.0)):
         model = make()
@@ -291,7 +291,7 @@ def test_what_the_task_never_reaches_has_no_gradient_where_the_sum_has_no_confli
                 model(pixels, ids, mask)
             read = torch.cat([model.vision(pixels).mT, model.text.words(ids)], 1)
             first, last = model.text.layers
-            # As an expert does that reads the last layer's keys and values alone.
+            # Like an expert that reads only the last layer's keys and values.
             loss = scale * last.qkv(last.norm1(first(read, ~mask))).square().mean()
             guard.backward(loss)
         grads.append([p.grad for p in model.parameters()])
@@ -301,7 +301,7 @@ def test_what_the_task_never_reaches_has_no_gradient_where_the_sum_has_no_confli
 
 
 def clear_past_the_count(model: nn.Module) -> None:
-    """Write zeros in a way that PyTorch's count of writes does not see."""
+    """Write zeros in a way that PyTorch's version counter does not see."""
     for parameter in model.parameters():
         if parameter.grad is not None:
             parameter.grad.data.zero_()
@@ -349,14 +349,14 @@ def test_cleared_gradients_are_not_kept_through_the_next_forward_pass(anchor: Pa
     guard.backward(loss)
     kept = weakref.ref(model.text.words.weight.grad)
     model.zero_grad()
-    assert kept() is not None  # the sum might have gone on
+    assert kept() is not None  # the sum might have continued
     with guard.watch(batch(0)[2]):
         assert kept() is None
         task_loss(model, 0)
 
 
 def test_a_gradient_that_lay_there_before_is_part_of_the_sum(anchor: Path) -> None:
-    """Another loss, backward first: the same as the guard's backward of both."""
+    """Another loss goes backward first: the result is the guard's backward of both losses."""
     first, both = make(), make()
     for model in (first, both):
         guard, other = (
@@ -402,7 +402,7 @@ def test_reentrant_checkpoints_are_refused_before_anything_is_written(
     model = make()
     if inside:
         model.around = through_checkpoint(reentrant=True)
-    else:  # a part of each layer alone
+    else:  # only part of each layer
         for layer in model.text.layers:
             layer.up.forward = through_reentrant(layer.up.forward)  # type: ignore[method-assign]
     guard = Guard(model, anchor, LAYERS)
@@ -453,7 +453,7 @@ def test_compiled_layers_change_nothing(how: str, anchor: Path) -> None:
 
 @compiling
 def test_layers_compiled_and_used_before_walk_their_graph_twice(anchor: Path) -> None:
-    """A plain backward pass has compiled a graph that gives its memory away."""
+    """A plain backward pass has compiled a graph that frees its memory."""
     import torch._functorch.config as config
 
     def compile_and_use(model: nn.Module) -> None:
@@ -475,7 +475,7 @@ def test_layers_compiled_and_used_before_walk_their_graph_twice(anchor: Path) ->
 
 @compiling
 def test_a_model_that_was_compiled_and_used_before_is_seen_by_a_later_guard(anchor: Path) -> None:
-    """Compiled code knows the hooks that were there when it was compiled."""
+    """Compiled code knows only the hooks that existed when it was compiled."""
     import torch._functorch.config as config
 
     def compile_and_use(model: nn.Module) -> None:
@@ -485,7 +485,7 @@ def test_a_model_that_was_compiled_and_used_before_is_seen_by_a_later_guard(anch
 
     torch._dynamo.reset()
     try:
-        with config.patch(donated_buffer=False):  # as an earlier guard has left it
+        with config.patch(donated_buffer=False):  # as an earlier guard leaves it
             found, rows = trained(anchor, compile_and_use)
     finally:
         torch._dynamo.reset()
@@ -496,7 +496,7 @@ def test_a_model_that_was_compiled_and_used_before_is_seen_by_a_later_guard(anch
 
 @pytest.mark.parametrize("scale", [2.0**8, 2.0**-3])
 def test_a_scaler_changes_nothing_but_the_scale(scale: float, anchor: Path) -> None:
-    """Two micro-batches a step, unscaled and clipped before it."""
+    """There are two micro-batches per step, which is unscaled and clipped."""
     found = []
     for scaler in (None, torch.amp.GradScaler("cpu", init_scale=scale)):
         model = make()
@@ -525,7 +525,7 @@ def test_a_scaler_changes_nothing_but_the_scale(scale: float, anchor: Path) -> N
 
 @pytest.mark.parametrize("at", ["task", "anchor"])
 def test_a_scaler_skips_the_step_of_an_overflow(at: str, anchor: Path) -> None:
-    """So it does where only the anchor gradient overflows, in a group that is not projected."""
+    """This holds even if only the anchor gradient overflows, in a group that is not projected."""
     model = make()
     guard, scaler = Guard(model, anchor, LAYERS), torch.amp.GradScaler("cpu", init_scale=4.0)
     optimizer, before = torch.optim.AdamW(model.parameters(), lr=1e-2), vector(model)
@@ -553,7 +553,7 @@ def test_a_scaler_skips_the_step_of_an_overflow(at: str, anchor: Path) -> None:
 def test_after_an_overflow_an_optimizer_that_clears_less_than_what_learns_is_refused(
     is_automatic: bool, anchor: Path
 ) -> None:
-    """The infinities that it leaves would have every later step skipped."""
+    """The infinities that it leaves would cause every later step to be skipped."""
     model = make()
     guard, scaler = Guard(model, anchor, LAYERS), torch.amp.GradScaler("cpu", init_scale=4.0)
     if is_automatic:
@@ -573,7 +573,7 @@ def test_after_an_overflow_an_optimizer_that_clears_less_than_what_learns_is_ref
 def step_with_an_overflow_outside(
     guard: Guard, optimizer: torch.optim.Optimizer, outside: nn.Parameter, by_guard: bool, bad: bool
 ) -> None:
-    """One step with a scaler of its own, which skips it where a gradient outside overflows."""
+    """One step with a new scaler, which skips it if a gradient outside overflows."""
     scaler = torch.amp.GradScaler("cpu", init_scale=4.0)
     with guard.watch(batch(0)[2]):
         loss = task_loss(guard._model, 0)
@@ -592,7 +592,7 @@ def step_with_an_overflow_outside(
 def test_a_step_that_is_skipped_for_others_gradients_has_no_row(
     kind: dict[str, bool], by_guard: bool, tmp_path: Path
 ) -> None:
-    """An action expert's overflow skips the VLM's step too, whose own gradients were finite."""
+    """An action expert's overflow skips the VLM's step too, though its gradients were finite."""
     model, outside = make(dtype=torch.float32), nn.Parameter(torch.zeros(2))
     path = measured(make(dtype=torch.float32), tmp_path / "anchor.safetensors")
     guard = Guard(model, path, LAYERS)
@@ -618,7 +618,7 @@ def test_a_batch_that_is_left_out_after_its_backward_pass_has_no_row(anchor: Pat
 
 
 class NotTorchs:
-    """An optimizer that is none of PyTorch's, and writes past PyTorch's count."""
+    """An optimizer that is not PyTorch's, and writes without changing PyTorch's version counter."""
 
     def __init__(self, model: nn.Module) -> None:
         self._model = model
@@ -642,7 +642,7 @@ def test_steps_of_an_optimizer_that_tells_nothing_have_their_rows(anchor: Path) 
 
 
 def test_only_the_projected_gradient_overflows(tmp_path: Path) -> None:
-    """In float16 a combination of two finite gradients may be none."""
+    """In float16, a combination of two finite gradients may not be finite."""
     model = make(dtype=torch.float16)
     guard = Guard(model, measured(model, tmp_path / "anchor.safetensors"), LAYERS)
     combine = guard._parts.combine
@@ -670,7 +670,7 @@ def test_only_the_projected_gradient_overflows(tmp_path: Path) -> None:
 
 
 class AsksItsScaler(torch.optim.AdamW):
-    """An optimizer by the older contract: its step is given the scaler, and asks that."""
+    """An optimizer with the older interface: its step receives the scaler and asks it."""
 
     def __init__(self, parameters: Any, **settings: Any) -> None:
         super().__init__(parameters, **settings)
@@ -688,7 +688,7 @@ class AsksItsScaler(torch.optim.AdamW):
 def test_an_optimizer_that_asks_its_scaler_skips_the_step_too(
     automatic: bool, anchor: Path
 ) -> None:
-    """Nothing is constrained of it, nor is it counted."""
+    """Its step is neither constrained nor counted."""
     model = make()
     guard = Guard(model, anchor, method="nullspace", vision="vision", every=2)
     optimizer = AsksItsScaler(model.parameters(), lr=0.01)
@@ -726,7 +726,7 @@ def scaled_step(
 
 
 def test_after_an_overflow_what_the_task_does_not_reach_has_no_gradient(tmp_path: Path) -> None:
-    """So training goes on where the optimizer does not have it, as if nothing had overflowed."""
+    """So if the optimizer does not have it, training continues as if nothing had overflowed."""
     model = make()
     model.spare = nn.Linear(3, 3).double()
     used = [p for name, p in model.named_parameters() if not name.startswith("spare")]
@@ -768,9 +768,9 @@ def test_without_a_scaler_what_is_not_finite_is_refused(method: str, at: str, an
 
 
 def test_autocast_reaches_the_forward_pass_alone(anchor: Path) -> None:
-    """Products are in bf16 and the penalty in float32, whether the backward is inside or out.
+    """Products are in bf16 and the penalty in float32, whether the backward is inside or outside.
 
-    The inner products are close to float32's.
+    The inner products are close to those in float32.
     """
     float32 = measured(make(dtype=torch.float32), anchor.with_name("float32.safetensors"))
     rows = []
@@ -843,7 +843,7 @@ def test_the_ledger_lists_what_learns_and_inspect_says_what_does_not(
 
 
 class Averaged(nn.Linear):
-    """Divides by a mean of its own making, as if by BatchNorm's."""
+    """Divides by a mean that it maintains itself, as BatchNorm does."""
 
     def __init__(self, width: int) -> None:
         super().__init__(width, width)
@@ -859,7 +859,7 @@ class Averaged(nn.Linear):
 
 @pytest.mark.parametrize("training", [False, True])
 def test_buffers_that_training_passes_change_are_told_once(training: bool, tmp_path: Path) -> None:
-    """Those that a checkpoint has, and only where they change."""
+    """Only the buffers that a checkpoint has, and only if they change."""
     model = make()
     model.text.norm = nn.Sequential(model.text.norm, Averaged(16).double())
     guard = Guard(model, measured(model, tmp_path / "anchor.safetensors"), LAYERS)
@@ -871,7 +871,7 @@ def test_buffers_that_training_passes_change_are_told_once(training: bool, tmp_p
 
 
 def test_what_lies_outside_the_model_is_left_to_the_task(anchor: Path) -> None:
-    """The anchor gradient reaches no action head, whatever it is told."""
+    """The anchor gradient never reaches an action head, whatever the guard is told."""
     model, head = make(), nn.Linear(WIDTH := 23, 2).double()
     guard = Guard(model, anchor, LAYERS)
     with guard.watch(batch(0)[2]):
@@ -892,9 +892,9 @@ def test_only_watched_passes_count(anchor: Path) -> None:
     for seed in range(3):
         with guard.watch(batch(seed)[2]):
             loss = task_loss(model, seed)
-        task_loss(model, seed + 50)  # a training pass that nobody watches
+        task_loss(model, seed + 50)  # a training pass without a watch
         guard.backward(loss)
-        optimizer.step()  # nothing constrains the update: the guard's step would be the same
+        optimizer.step()  # nothing constrains the update, so the guard's step would be the same
         optimizer.zero_grad()
         with torch.no_grad():
             task_loss(model, seed + 70)
@@ -907,7 +907,7 @@ def test_only_watched_passes_count(anchor: Path) -> None:
 
 
 def test_padding_never_counts_and_no_mask_is_every_token(anchor: Path) -> None:
-    """What stands at a padded token changes nothing; without a mask it does."""
+    """Values at a padded token change nothing; without a mask they do."""
     found = []
     for masked, noise in ((True, 0.0), (True, 5.0), (False, 0.0), (False, 5.0)):
         model = make()
@@ -928,7 +928,7 @@ def test_padding_never_counts_and_no_mask_is_every_token(anchor: Path) -> None:
 
 
 def test_masks_of_any_dtype_and_order_of_calls(anchor: Path) -> None:
-    """Image and text that pass the layers in turn are tokens in the order of the calls."""
+    """Image and text that go through the layers in turn are tokens in the order of the calls."""
     w2 = []
     for mask in (batch(0)[2], batch(0)[2].long(), batch(0)[2].float()):
         model = make()
@@ -968,7 +968,7 @@ def test_hooks_go_and_copies_stand_alone(anchor: Path) -> None:
         assert sum(len(m._forward_hooks) for m in model.modules()) == 2
     assert sum(len(m._forward_hooks) + len(m._forward_pre_hooks) for m in model.modules()) == 0
     optimizer = torch.optim.SGD(model.parameters(), lr=0.1)
-    optimizer.step()  # nothing is guarded any more
+    optimizer.step()  # nothing is guarded any longer
     with pytest.raises(AegisError, match="removed"):
         guard.backward(task_loss(model, 0))
 

@@ -74,7 +74,7 @@ def test_the_embedded_vlms_anchor_is_the_one_of_the_command() -> None:
 
 
 def test_the_embedded_vlms_inputs_are_those_of_the_command() -> None:
-    """Its tied head is no module: the guard sees that the table is scored."""
+    """Its tied head is no module: the guard notices that the table is used for scores."""
     model, asked = make_tiny(), make_questions()
     wanted = inputs.measure(model, asked, 1.0)
     with (
@@ -98,7 +98,7 @@ def test_the_embedded_vlms_inputs_are_those_of_the_command() -> None:
 def test_an_anchor_of_prompts_without_images_holds_all_their_tokens(
     anchor: Path, tmp_path: Path
 ) -> None:
-    """Of a language model there are text tokens alone: then they are all that is compared."""
+    """A language model has only text tokens, so only these are compared."""
     path, model = tmp_path / "text.safetensors", make()
     with Guard.measure(model, LAYERS) as found:
         for seed in range(100, 103):
@@ -120,7 +120,7 @@ def test_an_anchor_of_prompts_without_images_holds_all_their_tokens(
 
 
 def one_by_one(model: nn.Module, parts: Sequence[str] = ALL_PARTS) -> Anchor:
-    """Each question alone and without its padding."""
+    """The anchor from each question alone and without its padding."""
     with Guard.measure(model, LAYERS, parts=parts, vision="vision", energy=1.0) as found:
         for seed in range(100, 103):
             pixels, ids, mask = batch(seed)
@@ -133,7 +133,7 @@ def one_by_one(model: nn.Module, parts: Sequence[str] = ALL_PARTS) -> Anchor:
 
 
 def test_padding_never_counts(anchor: Path) -> None:
-    """Padded batches hold what the questions hold one by one.
+    """Padded batches give the same as the questions one by one.
 
     Pixels are never padded.
     """
@@ -152,7 +152,7 @@ def test_padding_never_counts(anchor: Path) -> None:
     assert words.tolist() == [
         1.0,
         *alone_words[1:].tolist(),
-    ]  # it reads 5 of the mask's 8 tokens: the padding word counts too
+    ]  # it reads 5 of the mask's 8 tokens: the padding token counts too
     for site, moment in theirs.items():
         torch.testing.assert_close(
             ours[site], moment, rtol=0, atol=2e-6 * moment.abs().max().item()
@@ -172,7 +172,7 @@ def test_the_file_says_what_was_measured(anchor: Path) -> None:
 
 
 def test_a_file_does_not_invent_a_number_of_samples(tmp_path: Path) -> None:
-    """Without layers and a mask, nothing tells how many a pass had."""
+    """Without layers and a mask, the number of samples in a pass is unknown."""
     model, path = make(), tmp_path / "anchor.safetensors"
     pixels, ids, mask = batch(0)
     for masks, samples in (([mask, mask], 8), ([mask, None], None)):
@@ -185,7 +185,7 @@ def test_a_file_does_not_invent_a_number_of_samples(tmp_path: Path) -> None:
 
 
 def test_inputs_that_are_not_finite_are_refused() -> None:
-    """As where float16 has overflowed; the eigensolver's own error would name no map."""
+    """As after a float16 overflow; the eigensolver's own error would name no map."""
     model, (pixels, ids, mask) = make(), batch(0)
     pixels[0, 0, 0, 0] = torch.inf
     with Guard.measure(model, parts=("inputs",), vision="vision") as found, found.watch(mask):
@@ -218,7 +218,7 @@ def test_a_mask_of_no_token_is_refused_whatever_is_measured() -> None:
 
 
 class Loose(Vlm):
-    """Uses parameters where no module runs: a table's rows, and a map's weight by itself."""
+    """Uses parameters outside of module calls: a table's rows, and a map's weight by itself."""
 
     def forward(self, pixels: Tensor, ids: Tensor, mask: Tensor) -> Tensor:
         scores = super().forward(pixels, ids, mask)
@@ -247,7 +247,7 @@ def test_parameters_used_outside_their_modules_are_not_taken_as_measured(tmp_pat
 
 
 class Shared(Vlm):
-    """One layer twice: all its maps read two sets of inputs."""
+    """One layer used twice: all its maps read two sets of inputs."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -292,7 +292,7 @@ def test_shared_maps_and_repeated_layers_are_measured_with_all_they_read(tmp_pat
 
 
 class Ids(nn.Module):
-    """A model whose words are all its tokens."""
+    """A model whose only tokens are words."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -307,7 +307,7 @@ class Ids(nn.Module):
 def test_a_table_of_all_tokens_leaves_the_padding_out(flat: bool) -> None:
     ids = torch.tensor([[3, 4, 5], [3, 0, 0]])
     with Guard.measure(Ids().eval(), parts=("inputs",), energy=1.0) as found, found.watch(ids != 0):
-        assert not found._model(ids, flat).requires_grad  # no graph is kept of questions
+        assert not found._model(ids, flat).requires_grad  # no graph is kept for questions
     read = found.anchor().inputs
     assert read["words"].values.nonzero().flatten().tolist() == [3, 4, 5]
     rows = F.pad(found._model.words.weight[[3, 4, 5, 3]], (0, 1), value=1.0).double()
@@ -320,7 +320,7 @@ WIDTH, HEADS = 8, 2
 
 
 class Heads(nn.Module):
-    """A map that reads a row for each head of each token, as norms of queries do."""
+    """A map that reads a row for each head of each token, as query norms do."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -357,13 +357,13 @@ def answers(model: nn.Module) -> Tensor:
     return torch.cat([model(*batch(seed))[batch(seed)[2]] for seed in range(100, 103)])
 
 
-# Free steps change these answers by 10. What is weaker than the float32 rounding of a map's
-# strongest input is not protected (core/spectrum.py), which is what is left.
+# Free steps change these answers by 10. What remains is below the float32 rounding of a map's
+# strongest input, and such directions are not protected (core/spectrum.py).
 STAYS = 1e-3
 
 
 def few_questions(model: nn.Module, path: Path, **options: Any) -> Path:
-    """An anchor that leaves room: one question, asked once."""
+    """An anchor that leaves room: a single question, asked once."""
     with Guard.measure(
         model, **({"parts": ("inputs",), "vision": "vision", "energy": 1.0} | options)
     ) as found:
@@ -383,7 +383,7 @@ def answer(model: nn.Module) -> Tensor:
 @compiling
 @pytest.mark.parametrize("build", ["plain", "compiled", "shared"])
 def test_answers_stay_while_the_model_learns(build: str, tmp_path: Path) -> None:
-    """AdamW with weight decay through `guard.step`: all that was asked is answered as before."""
+    """AdamW with weight decay through `guard.step`: all measured questions keep their answers."""
     with torch.random.fork_rng():
         torch.manual_seed(0)
         model = (Shared() if build == "shared" else Vlm()).double().eval()
@@ -452,7 +452,7 @@ def test_a_step_inside_of_autocast_is_projected_as_finely(tmp_path: Path) -> Non
 
 @pytest.mark.parametrize("end", ["settle", "remove", "in its turn"])
 def test_several_steps_are_projected_together(end: str, tmp_path: Path) -> None:
-    """Until then the weights also hold what the last steps have moved along what was asked."""
+    """Until then the weights also have the movement of the last steps along the questions."""
     model = make()
     path, said = few_questions(model, tmp_path / "anchor.safetensors"), answer(model)
     guard = Guard(model, path, method="nullspace", vision="vision", energy=1.0, every=3)
@@ -467,7 +467,7 @@ def test_several_steps_are_projected_together(end: str, tmp_path: Path) -> None:
         getattr(guard, end)()
     after = vector(model)
     assert (answer(model) - said).abs().max() < STAYS
-    guard.remove()  # and nothing more is done to what has been settled
+    guard.remove()  # and nothing that has been settled changes any more
     assert torch.equal(vector(model), after)
 
 
@@ -527,7 +527,7 @@ def test_a_table_read_at_positions_is_protected_whole(tmp_path: Path) -> None:
 
 
 class Parted(Vlm):
-    """A lone row between image and words, and one that nobody reads but the loss."""
+    """A lone row between image and words, and one that only the loss reads."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -586,7 +586,7 @@ ADDED = 4
 
 
 def resized(model: Vlm) -> Vlm:
-    """The model after resize_token_embeddings: its tied table has rows after the old ones."""
+    """The model after resize_token_embeddings: its tied table has extra rows after the old ones."""
     old = model.text.words
     words, width = old.weight.shape
     with torch.random.fork_rng():
@@ -626,5 +626,5 @@ def test_of_a_resized_table_what_questions_read_stays_and_new_rows_learn(tmp_pat
     guard.step(optimizer)
     moved = (table.detach() - before).norm(dim=1)
     assert float(moved[sorted(asked - {0})].max()) < 1e-12
-    # How far depends on what it began as, for the head scores with it as well.
+    # How far depends on their initial values, since the head scores with them too.
     assert float(moved[len(table) - ADDED]) > 1e-6

@@ -1,4 +1,4 @@
-"""The guard of a Hugging Face model takes what `aegis anchor` has measured on its folder."""
+"""The guard of a Hugging Face model accepts an anchor of `aegis anchor` on its folder."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ IDS = torch.arange(24).view(4, 6) % 20
 
 
 class Residual(nn.Module):
-    """Layers whose sums are made in place or not, of what their first maps have read or a copy."""
+    """Layers that add in place or not; their first maps read the sum itself or a copy."""
 
     def __init__(self, in_place: bool, copied: bool) -> None:
         super().__init__()
@@ -30,7 +30,7 @@ class Residual(nn.Module):
     def forward(self, ids: Tensor) -> Tensor:
         x = self.words(ids)
         for layer in self.layers:
-            # Autograd needs what a map that learns has read, and would itself refuse.
+            # Autograd needs the input of a trainable map, and would itself raise an error.
             added = layer(x.clone() if self.copied else x)
             if self.in_place:
                 x += added
@@ -61,7 +61,7 @@ def test_a_residual_stream_that_is_added_to_in_place_is_measured_like_another() 
 
 
 def test_what_a_map_has_read_may_not_change_before_it_is_counted() -> None:
-    """Of a frozen map autograd does not need it, and says nothing."""
+    """For a frozen map autograd does not need the input, and raises no error."""
     with pytest.raises(AegisError, match="changed in place"):
         curvature(in_place=True, copied=False, frozen=True)
 

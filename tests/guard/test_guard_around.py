@@ -1,4 +1,4 @@
-"""What lies around the guarded part of a policy is left to the task alone, sharded or not."""
+"""The rest of a policy around the guarded part gets only the task's gradient, sharded or not."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def test_a_states_map_around_a_sharded_vlm_has_the_tasks_gradient(tmp_path: Path
 
 
 def test_the_second_pass_adds_to_no_gradient_that_it_was_not_asked_for() -> None:
-    """Neither to a leaf of its graph nor to others that are named."""
+    """It adds neither to a leaf of its graph nor to other named parameters."""
     inside, before = nn.Parameter(torch.ones(3)), nn.Parameter(torch.ones(3))
     elsewhere = nn.Parameter(torch.ones(2))
     hidden = before * inside * 2

@@ -1,4 +1,4 @@
-"""An automatic guard: plain `backward()` and `step()` do what guarded ones do."""
+"""An automatic guard: plain `backward()` and `step()` act like guarded ones."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ def test_passes_add_up_before_a_step(name: str, anchors: dict[str, Path]) -> Non
         guard.settle()
         found.append((vector(model), guard.ledger.tensors()))
     (one, rows), (other, others) = found
-    # Adam divides by the root of a gradient's square, where the order of a sum shows.
+    # Adam divides by the root of the squared gradient, so the order of a sum becomes visible.
     torch.testing.assert_close(other, one, rtol=1e-6, atol=1e-8)
     for values, expected in zip(others.values(), rows.values(), strict=True):
         torch.testing.assert_close(values, expected, rtol=1e-6, atol=1e-12)
@@ -123,7 +123,7 @@ def test_passes_add_up_before_a_step(name: str, anchors: dict[str, Path]) -> Non
 
 @every_method
 def test_an_optimizer_that_calls_the_passes_itself(name: str, anchors: dict[str, Path]) -> None:
-    """As Lightning's do: forward pass, `zero_grad` and backward pass lie inside the step."""
+    """As Lightning's do: forward pass, `zero_grad` and backward pass happen inside the step."""
     expected, guard = automatic(name, anchors)
     plain_steps(expected)
     guard.settle()
@@ -144,7 +144,7 @@ def test_an_optimizer_that_calls_the_passes_itself(name: str, anchors: dict[str,
 
 
 class Decayed(torch.optim.SGD):
-    """One that moves the weights once more after its base class's step, as home-made ones do."""
+    """A class that moves the weights again after its base class's step, as custom ones do."""
 
     @torch.no_grad()
     def step(self, closure: Any = None) -> Any:
@@ -159,7 +159,7 @@ class Decayed(torch.optim.SGD):
 def test_an_optimizer_that_goes_on_after_its_base_classs_step(
     name: str, anchors: dict[str, Path]
 ) -> None:
-    """What comes after the inner step is constrained too, also where a step has failed before."""
+    """Changes after the inner step are constrained too, even after a step that failed."""
     ends = []
     for is_automatic in (False, True):
         model, guard = (automatic if is_automatic else guarded)(name, anchors)
@@ -200,7 +200,7 @@ def test_a_step_that_raises_is_constrained_with_the_next_one(anchors: dict[str, 
             optimizer.step()
         optimizer.zero_grad()
     assert not torch.equal(vector(model), vector(start))
-    pixels, ids, mask = batch(100)  # of those that the anchor was measured on
+    pixels, ids, mask = batch(100)  # one of those on which the anchor was measured
     with torch.no_grad():
         before, after = (m(pixels, ids, mask)[mask] for m in (start, model))
     torch.testing.assert_close(after, before, rtol=0, atol=1e-5)
@@ -217,9 +217,9 @@ def test_several_guards_each_see_their_own_model(anchors: dict[str, Path]) -> No
 
 
 def test_small_anchor_gradients_are_those_of_a_loop_that_calls_the_guard(tmp_path: Path) -> None:
-    """The penalty is scaled before it goes back: in half precision its gradients vanish otherwise.
+    """The penalty is scaled before its backward pass; in half precision its gradients would vanish.
 
-    The variances are those of a deep model's residual stream, which the penalty divides by.
+    The penalty is divided by the variances, which are those of a deep model's residual stream.
     """
     model = deep()
     path = measured(model, tmp_path / "anchor.safetensors", parts=("moments",))
@@ -256,7 +256,7 @@ def deep() -> Vlm:
 
 @pytest.mark.parametrize("is_automatic", [False, True])
 def test_a_step_that_overflows_counts_once(is_automatic: bool, anchors: dict[str, Path]) -> None:
-    """However many micro-batches follow in it; it has no row, since no weight moves."""
+    """This holds however many micro-batches it has; it has no row, since no weight moves."""
     model, guard = guarded("aegis", anchors)
     scaler = torch.amp.GradScaler("cpu", init_scale=256.0)
     if is_automatic:
@@ -281,7 +281,7 @@ def test_a_step_that_overflows_counts_once(is_automatic: bool, anchors: dict[str
 
 
 def test_an_exception_in_a_backward_pass_ends_no_training(anchors: dict[str, Path]) -> None:
-    """Such as for want of memory, after which a loop goes on with less."""
+    """For example an out-of-memory error, after which a loop continues with a smaller batch."""
     model, _guard = automatic("aegis", anchors)
     optimizer = torch.optim.SGD(model.parameters(), lr=0.1)
     one, _ = automatic("aegis", anchors)
@@ -303,7 +303,7 @@ def test_an_exception_in_a_backward_pass_ends_no_training(anchors: dict[str, Pat
 
 
 class FailsOnce(torch.autograd.Function):
-    """Gives back its input, and fails in the first backward pass that comes to it."""
+    """Returns its input, and fails in its first backward pass."""
 
     failed = False
 
@@ -320,7 +320,7 @@ class FailsOnce(torch.autograd.Function):
 
 
 class WithLoss(nn.Module):
-    """Calls the model, and makes the loss of its scores, as Hugging Face models do."""
+    """Calls the model and computes the loss from its scores, as Hugging Face models do."""
 
     def __init__(self, model: Vlm) -> None:
         super().__init__()
@@ -348,7 +348,7 @@ def test_a_backward_pass_may_fail_before_it_comes_to_the_first_parameter(
 
 
 def test_a_gradient_of_the_inputs_alone_takes_no_pass_away(anchors: dict[str, Path]) -> None:
-    """It ends well, and the loss of the same pass is still to go back."""
+    """It works, and the loss of the same pass can still go backward."""
     model, guard = automatic("aegis", anchors)
     pixels, ids, mask = batch(0)
     loss = model(pixels.requires_grad_(), ids, mask).square().mean()
@@ -359,7 +359,7 @@ def test_a_gradient_of_the_inputs_alone_takes_no_pass_away(anchors: dict[str, Pa
 
 
 def scaled_steps(model: nn.Module, scaler: torch.amp.GradScaler) -> None:
-    """Three steps of AdamW, of losses that a scaler has made larger."""
+    """Three steps of AdamW, with losses that are multiplied by a scaler."""
     optimizer = torch.optim.AdamW(model.parameters(), lr=1e-2)
     for seed in range(3):
         scaler.scale(task_loss(model, seed)).backward()
@@ -381,7 +381,7 @@ def test_a_scaler_leaves_the_steps_as_they_are(anchors: dict[str, Path]) -> None
 
 
 def test_a_scaler_that_was_not_given_shows_in_the_ledger_alone(anchors: dict[str, Path]) -> None:
-    """As docs/guard.md says: the projection is the same whatever scale the task's gradient has."""
+    """As docs/guard.md says: the projection does not depend on the scale of the task's gradient."""
     scale, found = 256.0, []
     for told in (True, False):
         scaler = torch.amp.GradScaler("cpu", init_scale=scale)
@@ -472,7 +472,7 @@ def test_a_batch_that_is_skipped(anchors: dict[str, Path]) -> None:
 def test_after_a_loss_that_fails_the_next_pass_says_how_to_go_on(
     backward: bool, anchors: dict[str, Path]
 ) -> None:
-    """Outside the model's call: while it is computed, or before its backward pass comes there."""
+    """Outside the model's call: while the loss is computed, or before its backward pass arrives."""
     expected, guard = automatic("aegis", anchors)
     plain_steps(expected)
     model, other = automatic("aegis", anchors)
@@ -510,7 +510,7 @@ def test_it_stays_at_work_though_nobody_keeps_it(anchors: dict[str, Path]) -> No
 
 @pytest.fixture
 def group(tmp_path: Path) -> Iterator[None]:
-    """A process group of this process alone."""
+    """A process group with only this process."""
     dist.init_process_group("gloo", f"file://{tmp_path}/store", rank=0, world_size=1)
     yield
     dist.destroy_process_group()
@@ -608,7 +608,7 @@ def test_a_loss_that_is_not_finite(name: str, anchors: dict[str, Path]) -> None:
 def test_a_trainer_with_closures_beside_a_guard_is_refused(
     name: str, anchors: dict[str, Path]
 ) -> None:
-    """Such a step makes its gradients itself, and would train unguarded without a word."""
+    """Such a step computes its gradients itself, and would silently train unguarded."""
     model, _guard = guarded(name, anchors)
     optimizer, before = torch.optim.AdamW(model.parameters(), lr=0.1), vector(model)
 
@@ -649,7 +649,7 @@ class BreakingSGD(torch.optim.SGD):
 def test_what_a_broken_step_has_moved_is_constrained_and_nothing_else(
     name: str, by_itself: bool, when: str, anchors: dict[str, Path]
 ) -> None:
-    """The next steps are those of a loop where it ended well, or was left out."""
+    """The next steps equal those of a loop in which it succeeded, or was left out."""
     found = []
     for breaks in (True, False):
         model, guard = automatic(name, anchors) if by_itself else guarded(name, anchors)
@@ -677,7 +677,7 @@ def test_what_a_broken_step_has_moved_is_constrained_and_nothing_else(
 
 @pytest.mark.parametrize("name", ["aegis", "nullspace", "kfac"])
 def test_two_guards_on_a_shared_parameter_are_refused(name: str, anchors: dict[str, Path]) -> None:
-    """What the second one leaves lies again in the directions that the first one holds."""
+    """The second guard's result has parts again in the directions that the first one protects."""
     one, first = automatic(name, anchors)
     task_loss(one, 0).backward()
     one.zero_grad()

@@ -1,4 +1,4 @@
-"""A program that makes its tensors on a GPU by default is guarded like one that does not."""
+"""A program whose default device is a GPU is guarded like any other."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ BATCHES = [batch(seed) for seed in range(3)]
 
 @pytest.mark.parametrize("method", METHODS)
 def test_a_guard_makes_nothing_on_the_default_device(method: str, tmp_path: Path) -> None:
-    """On the device "meta" numbers have no values: what the guard makes there cannot be used."""
+    """On the device "meta" numbers have no values, so anything the guard makes there is useless."""
     on_cpu = measured_and_trained(method, tmp_path, "cpu")
     assert torch.equal(measured_and_trained(method, tmp_path, "meta"), on_cpu)
 
@@ -25,8 +25,8 @@ def test_a_guard_makes_nothing_on_the_default_device(method: str, tmp_path: Path
 def begun(optimizer: torch.optim.Optimizer) -> torch.optim.Optimizer:
     """The optimizer after a step without gradients.
 
-    The first step makes its state, and some versions of PyTorch make that of Adam on the default
-    device, which is not what is asked here.
+    The first step makes its state, and some versions of PyTorch make Adam's state on the default
+    device, which is not what this test checks.
     """
     for group in optimizer.param_groups:
         for weight in group["params"]:
@@ -37,7 +37,7 @@ def begun(optimizer: torch.optim.Optimizer) -> torch.optim.Optimizer:
 
 
 def measured_and_trained(method: str, folder: Path, default: str) -> Tensor:
-    """The weights after three steps, with an anchor that was measured by the same program."""
+    """The weights after three steps, with an anchor measured by the same program."""
     model, path = make(), folder / f"{default}.safetensors"
     optimizer = begun(torch.optim.AdamW(model.parameters(), lr=1e-2))
     parts = ("curvature",) if method == "kfac" else ("moments", "inputs")

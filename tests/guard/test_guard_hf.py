@@ -116,7 +116,7 @@ def test_the_loop_of_the_readme(anchor: Path, tmp_path: Path) -> None:
         "layers.0",
         "layers.1",
         *outside,
-    )  # the head is the embeddings' twin
+    )  # the head shares the embeddings' weight
     assert len(guard.ledger) == 3 and (rows["ta"] < 0).any() and (rows["w2"] > 0).all()
     assert (rows["aa"][:, :-1] > 0).all() and not rows["aa"][:, -1].any()
     assert not torch.equal(after, vector(make()))
@@ -160,7 +160,7 @@ def test_moments_are_those_of_the_hidden_states_at_valid_tokens(anchor: Path) ->
             asked = batch(seed)
             states = model(**asked, output_hidden_states=True).hidden_states[
                 1
-            ]  # after the first layer
+            ]  # the first layer's hidden states
             seen.append(
                 states[(asked["attention_mask"] == 1) & (asked["input_ids"] != IMAGE)].double()
             )
@@ -172,7 +172,7 @@ def test_moments_are_those_of_the_hidden_states_at_valid_tokens(anchor: Path) ->
 
 
 def test_the_null_space_holds_every_part_of_the_model(anchor: Path) -> None:
-    """Gemma's normalisations, its scaled table and the tied head included; nothing is frozen."""
+    """This includes Gemma's normalisations, scaled table and tied head; nothing is frozen."""
     model = make()
     with Guard(model, anchor, method="nullspace", vision=PIXELS, energy=1.0) as guard:
         assert guard.unprotected == ()
@@ -192,7 +192,7 @@ def test_the_null_space_holds_every_part_of_the_model(anchor: Path) -> None:
 
 
 def test_the_null_space_names_what_it_cannot_hold(anchor: Path) -> None:
-    """The same weights, but one normalisation does more than scale."""
+    """The weights are the same, but one normalisation does more than scale."""
     model = make()
     norm = model.model.language_model.norm
     plain = type(norm)
@@ -208,7 +208,7 @@ def test_the_null_space_names_what_it_cannot_hold(anchor: Path) -> None:
 
 
 def test_kfac_in_a_loop_draws_back_what_answers_mind(tmp_path: Path) -> None:
-    """As the README has it: normalisations and tables frozen, words drawn where labels are."""
+    """As in the README: normalisations and tables frozen, words drawn where labels are."""
     for_maps = (nn.Linear, nn.Conv2d)
     model, path = make(), tmp_path / "anchor.safetensors"
     for module in model.modules():
@@ -243,7 +243,7 @@ def test_kfac_in_a_loop_draws_back_what_answers_mind(tmp_path: Path) -> None:
         divergence = 0.0
         with torch.no_grad():
             for seed in range(3):
-                # In float64: what is drawn back strongly differs by less than float32 resolves.
+                # In float64: if drawn back strongly, the difference is less than float32 resolves.
                 asked = batch(seed)
                 asked["pixel_values"] = asked["pixel_values"].double()
                 before, after = (

@@ -1,4 +1,4 @@
-"""`kfac` in a plain loop: how a model that is not ours is measured for it, and what it does."""
+"""`kfac` in a plain loop: how a model that is not ours is measured for it, and its effect."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def only_maps(model: nn.Module) -> nn.Module:
 def asked(
     model: nn.Module, found: Any, change: Callable[[Tensor], Tensor] = lambda ids: ids
 ) -> None:
-    """Three passes; the last word of each text that is no padding is the answer."""
+    """Three passes; the answer is the last word of each text that is not padding."""
     for seed in range(100, 103):
         pixels, ids, mask = batch(seed, dtype=next(model.parameters()).dtype)
         with found.watch(mask, IMAGE):
@@ -83,7 +83,7 @@ def read(path: Path) -> Anchor:
 def test_the_embedded_vlms_curvature_is_that_of_the_command(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Where both draw the same words: the command draws each question's by its number."""
+    """This holds if both draw the same words: the command draws each question's by its number."""
     monkeypatch.setattr(
         curvature, "_uniform", lambda _, question: torch.full((len(question),), 0.5)
     )
@@ -109,7 +109,7 @@ def test_the_embedded_vlms_curvature_is_that_of_the_command(
 
 
 def test_what_no_answer_reads_does_not_count(tmp_path: Path) -> None:
-    """Padding is not told, and other words there change nothing."""
+    """Padding is not declared, and other words there change nothing."""
     spectra = []
     for word in (0, 5):
         model = make()
@@ -122,7 +122,7 @@ def test_what_no_answer_reads_does_not_count(tmp_path: Path) -> None:
 
 
 class FamilyNorm(nn.Module):
-    """The RMS norm of a model family: a class of its own, known by what it does."""
+    """The RMS norm of a model family: a class of its own, recognised by its behaviour."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -133,7 +133,7 @@ class FamilyNorm(nn.Module):
 
 
 def test_a_familys_norms_are_measured_beside_the_curvature() -> None:
-    """The curvature tries a norm out to know it, which is no use of its weight by the model."""
+    """The curvature calls a norm to recognise it, which does not count as a use of its weight."""
     found = {}
     for parts in (("inputs",), ("inputs", "curvature")):
         model = make()
@@ -204,7 +204,7 @@ def test_a_frozen_tower_is_not_measured_and_not_needed(tmp_path: Path) -> None:
 
 
 class Loose(Vlm):
-    """Uses a map's weight where its module does not run."""
+    """Uses a map's weight outside of its module's call."""
 
     def forward(self, pixels: Tensor, ids: Tensor, mask: Tensor) -> Tensor:
         scores = super().forward(pixels, ids, mask)
@@ -249,7 +249,7 @@ def test_every_pass_has_its_answers() -> None:
 
 
 class Reads(TorchDispatchMode):
-    """Counts the numbers that are read, for each of which a GPU would wait."""
+    """Counts reads of numbers, for each of which a GPU would wait."""
 
     count = 0
 
@@ -289,7 +289,7 @@ def steps(model: nn.Module, guard: Guard, count: int = 4, **adam: Any) -> None:
 def test_under_a_strong_pull_nothing_is_left_of_what_answers_mind(
     build: str, tmp_path: Path
 ) -> None:
-    """And what they do not mind goes on learning."""
+    """Directions that do not matter to answers continue to learn."""
     model = only_maps(make())
     path = measured(model, tmp_path / "anchor.safetensors")
     origin = {site: tuple(t.detach().clone() for t in weights(model, site)) for site in MAPS}
@@ -305,7 +305,7 @@ def test_under_a_strong_pull_nothing_is_left_of_what_answers_mind(
     }
     for name, site in names.items():
         moved = minus(weights(model, name), origin[site])
-        kept = found[site].excess(*moved, 1e3)  # of what a weaker pull would take away
+        kept = found[site].excess(*moved, 1e3)  # which a weaker pull would remove
         assert (
             max(part.abs().max().item() for part in kept)
             < 1e-6
@@ -350,7 +350,7 @@ def test_a_step_past_the_guard_is_refused(options: dict[str, float], tmp_path: P
 
 
 def test_a_scaler_skips_the_step_of_an_overflow_and_changes_no_other(tmp_path: Path) -> None:
-    """Not even the pull is left of the skipped step."""
+    """Not even the pull of the skipped step remains."""
     ends = []
     for scaled in (False, True):
         model = only_maps(make())
@@ -377,7 +377,7 @@ def test_a_scaler_skips_the_step_of_an_overflow_and_changes_no_other(tmp_path: P
 def test_an_overflow_in_one_map_moves_nothing(
     fused: bool, is_automatic: bool, tmp_path: Path
 ) -> None:
-    """A fused optimizer is called for such a step too, and leaves it out within its kernel."""
+    """A fused optimizer is called for such a step too, and skips it inside its kernel."""
     model, plain = only_maps(make()), only_maps(make())
     path = measured(model, tmp_path / "anchor.safetensors")
     ends = []

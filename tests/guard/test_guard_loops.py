@@ -1,6 +1,6 @@
-"""The guard in trainers: what they do with it is what the guard's own loop does.
+"""The guard in trainers: the result is that of the guard's own loop.
 
-Hugging Face's Trainer, accelerate and Lightning, each skipped where it is not installed.
+Hugging Face's Trainer, accelerate and Lightning, each skipped if it is not installed.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ METHODS: dict[str, dict[str, Any]] = {
     "kfac": {"protect": ("maps",)},
 }
 every_method = pytest.mark.parametrize("method", METHODS)
-# Trainers warn of much that is theirs: workers, loggers, schedulers.
+# Trainers raise many warnings of their own: about workers, loggers, schedulers.
 pytestmark = pytest.mark.filterwarnings("default")
 
 Rows = list[dict[str, Tensor]]
 
 
 class Robot(nn.Module):
-    """The model as a Trainer calls it: arguments by name, a mapping with the loss."""
+    """The model as a Trainer calls it: keyword arguments in, a mapping with the loss out."""
 
     def __init__(self, vlm: Vlm) -> None:
         super().__init__()
@@ -85,7 +85,7 @@ def guarded(anchors: dict[str, Path]) -> Guarded:
 
 
 def by_hand(model: Vlm, guard: Guard | None) -> Tensor:
-    """The weights after the guard's own loop, or without it a naive one."""
+    """The weights after the guard's own loop, or after a naive one if there is no guard."""
     optimizer = torch.optim.SGD(model.parameters(), lr=RATE)
     for given in DataLoader(rows(), SIZE):
         if guard is None:
@@ -103,7 +103,7 @@ def by_hand(model: Vlm, guard: Guard | None) -> Tensor:
 
 
 def check(model: Vlm, guard: Guard, method: str, guarded: Guarded) -> None:
-    """What a trainer has made of the model is what the guard's loop makes of it."""
+    """The trainer's result for the model is that of the guard's loop."""
     other, its = guarded(method)
     guard.settle()
     torch.testing.assert_close(vector(model), by_hand(other, its), rtol=1e-9, atol=1e-9)
@@ -151,7 +151,7 @@ def test_a_trainer_with_the_callback(method: str, guarded: Guarded, tmp_path: Pa
 
 
 def test_a_trainer_in_passes_of_a_part_of_the_batch(guarded: Guarded, tmp_path: Path) -> None:
-    """The sum of their gradients is projected, as in one pass; the anchor's is the mean."""
+    """The sum of their gradients is projected, as in one pass; the anchor gradient is the mean."""
     model, guard = guarded("aegis")
     settings = {"per_device_train_batch_size": 2, "gradient_accumulation_steps": 2}
     trainer(model, tmp_path, [guard.callback(mask="mask")], **settings).train()
@@ -166,7 +166,7 @@ def test_a_trainer_in_passes_of_a_part_of_the_batch(guarded: Guarded, tmp_path: 
 def test_a_trainer_settles_before_it_evaluates(
     when: dict[str, Any], times: int, guarded: Guarded, tmp_path: Path
 ) -> None:
-    model, guard = guarded("nullspace")  # it constrains every second step, and takes three
+    model, guard = guarded("nullspace")  # it constrains every second step; three are taken
     given = trainer(model, tmp_path, [guard.callback()], **when)
     pending = []
     evaluate = given.evaluate
@@ -193,7 +193,7 @@ def test_a_trainer_of_another_model(guarded: Guarded, tmp_path: Path) -> None:
 def test_a_callback_says_why_transformers_cannot_be_imported(
     guarded: Guarded, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As beside a peft that asks it for names of an older one."""
+    """As with a peft that imports names of an older version from it."""
     _, guard = guarded("aegis")
     monkeypatch.setitem(sys.modules, "transformers", types.ModuleType("transformers"))
     with pytest.raises(AegisError) as caught:
@@ -272,7 +272,7 @@ def test_lightning_beside_a_guard_is_refused(
 
 
 def test_lightning_clips_what_is_projected(guarded: Guarded) -> None:
-    """Accumulated and clipped, its ledger still has a row a step."""
+    """Accumulated and clipped, its ledger still has one row per step."""
     model, guard = guarded("aegis")
     guard.automatic(mask="mask")
     fit(model, True, gradient_clip_val=0.01, accumulate_grad_batches=2)

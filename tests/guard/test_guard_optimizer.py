@@ -1,4 +1,4 @@
-"""AdamW that protects a VLM whose parameters have no names: only their values tell them."""
+"""AdamW that protects a VLM whose parameters have no names: it is recognised by their values."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def measured(folder: Path, path: Path) -> Path:
 
 
 class Foreign(nn.Module):
-    """A policy of another program: the VLM somewhere inside, and an expert that reads it."""
+    """A policy of another program: the VLM somewhere inside, and an expert that reads from it."""
 
     def __init__(self, tiny_folder: Path) -> None:
         super().__init__()
@@ -83,7 +83,7 @@ def interrupted_and_whole(
     teach: Callable[[nn.Module, torch.optim.Optimizer, range], None],
     made: Callable[[Foreign], ProtectedAdamW],
 ) -> tuple[ProtectedAdamW, ProtectedAdamW]:
-    """The optimizers of a training that was resumed, and of one in one go, of equal weights."""
+    """The optimizers of a resumed training and of an uninterrupted one, with equal weights."""
     model = fresh()
     optimizer = made(model)
     teach(model, optimizer, range(2))
@@ -152,7 +152,7 @@ def test_with_kfac_normalisations_and_tables_of_the_vlm_do_not_learn(
     tiny_folder: Path, base: Backbone, anchor: Path
 ) -> None:
     model = Foreign(tiny_folder)
-    gradients(model, 0)  # of a pass before the optimizer was made
+    gradients(model, 0)  # from a pass before the optimizer was made
     optimizer = make(model, "kfac", anchor, base)
     still = {name for name, p in model.named_parameters() if not p.requires_grad}
     assert still == {
@@ -172,7 +172,7 @@ def test_with_kfac_normalisations_and_tables_of_the_vlm_do_not_learn(
 def test_an_experts_new_norms_learn_with_kfac(
     place: str, decays_apart: bool, tiny_folder: Path, base: Backbone, anchor: Path
 ) -> None:
-    """They have the values of the norms of this VLM, which is untrained and whose own do not."""
+    """They have the same values as the norms of this untrained VLM, which stay frozen."""
     model = Foreign(tiny_folder)
     expert = make_tiny(9).layers[0]
     setattr(model, place, expert)
@@ -184,7 +184,7 @@ def test_an_experts_new_norms_learn_with_kfac(
 
 
 def in_groups(model: nn.Module, decays_apart: bool) -> list[dict[str, Any]]:
-    """The optimizer's groups: one, or as often one whose parameters decay and another one."""
+    """The optimizer's groups: one, or as is common two, one of which decays."""
     parameters = list(model.parameters())
     if not decays_apart:
         return [{"params": parameters}]
@@ -231,7 +231,7 @@ def test_a_vlm_that_has_learned_before_is_refused_before_anything_moves(
 
 
 def learned(module: nn.Module) -> None:
-    """Moves a module's weights as a training would have, by about a tenth of their size."""
+    """Moves a module's weights as training would, by about a tenth of their size."""
     generator = torch.Generator().manual_seed(3)
     with torch.no_grad():
         for parameter in module.parameters():
@@ -253,7 +253,7 @@ def refused_at_the_first_step(model: nn.Module, optimizer: ProtectedAdamW, match
 def test_a_vlm_of_which_a_part_has_learned_is_refused(
     method: str, part: str, tiny_folder: Path, base: Backbone, anchor: Path
 ) -> None:
-    """As after a training with the rest frozen: what has moved would go unprotected."""
+    """As after a training with the rest frozen: the moved part would be unprotected."""
     model = Foreign(tiny_folder)
     learned(model.inner["vlm"].get_submodule(part))
     optimizer = make(model, method, anchor, base)
@@ -262,7 +262,7 @@ def test_a_vlm_of_which_a_part_has_learned_is_refused(
 
 @pytest.fixture(scope="module")
 def trained_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A VLM whose normalisations have values of their own, and its anchor."""
+    """A VLM whose normalisations have distinct values, and its anchor."""
     folder = tmp_path_factory.mktemp("trained")
     trained = make_tiny()
     for number, module in enumerate(trained.modules()):
@@ -282,7 +282,7 @@ def made_of(folder: Path, model: nn.Module, method: str) -> ProtectedAdamW:
 def test_norms_and_tables_that_have_learned_are_refused(
     part: str, method: str, trained_folder: Path
 ) -> None:
-    """Also where all maps are as they were: nothing would hold what has moved."""
+    """This holds even if all maps are unchanged: nothing would protect the part that has moved."""
     model = Foreign(trained_folder)
     train(model, made_of(trained_folder, model, method), range(1))
     model = Foreign(trained_folder)
@@ -293,11 +293,11 @@ def test_norms_and_tables_that_have_learned_are_refused(
     refused_at_the_first_step(model, optimizer, f"near {part}")
     model.inner["vlm"].get_submodule(part).requires_grad_(False)
     optimizer = made_of(trained_folder, model, method)
-    train(model, optimizer, range(1))  # they stay as they are
+    train(model, optimizer, range(1))  # they stay unchanged
 
 
 def test_the_norms_of_missing_layers_are_not_looked_for(trained_folder: Path) -> None:
-    """An expert's, of the same size, may be near them."""
+    """An expert's norms of the same size may be close to them."""
     model = Foreign(trained_folder)
     layer = model.inner["vlm"].layers[-1]
     del model.inner["vlm"].layers[-1]
@@ -312,7 +312,7 @@ def test_the_norms_of_missing_layers_are_not_looked_for(trained_folder: Path) ->
 
 @pytest.mark.parametrize("method", ["kfac", "nullspace"])
 def test_a_resized_table_is_refused_unless_it_is_frozen(method: str, trained_folder: Path) -> None:
-    """As after resize_token_embeddings: no method knows its old rows in the larger table."""
+    """As after resize_token_embeddings: no method can find its old rows in the larger table."""
     model = Foreign(trained_folder)
     vlm = model.inner["vlm"]
     larger = nn.Embedding(len(vlm.words.weight) + 5, vlm.words.weight.shape[1])
@@ -340,7 +340,7 @@ def test_what_kfac_has_frozen_may_not_learn_again(
 
 @pytest.mark.parametrize("method", ["kfac", "nullspace"])
 def test_maps_that_learn_later_are_refused(method: str, trained_folder: Path) -> None:
-    """Nothing would hold them: the method has started without them."""
+    """Nothing would protect them: the method has started without them."""
     model = Foreign(trained_folder)
     layer = model.inner["vlm"].layers[1].requires_grad_(False)
     optimizer = made_of(trained_folder, model, method)
@@ -368,7 +368,7 @@ def test_a_resumed_training_may_let_more_maps_learn(trained_folder: Path) -> Non
 def test_what_is_missing_or_frozen_or_the_experts_own_is_no_vlm_that_has_learned(
     method: str, tiny_folder: Path, base: Backbone, anchor: Path
 ) -> None:
-    """The optimizer lacks a tower, a layer has learned and is frozen, an expert has its shapes."""
+    """The optimizer lacks a tower, a frozen layer has learned, an expert has the same shapes."""
     model = Foreign(tiny_folder)
     vlm = model.inner["vlm"]
     learned(vlm.layers[1])
@@ -390,7 +390,7 @@ def test_what_is_missing_or_frozen_or_the_experts_own_is_no_vlm_that_has_learned
 def test_a_map_that_is_half_frozen_is_refused(
     given: bool, half: str, method: str, tiny_folder: Path, base: Backbone, anchor: Path
 ) -> None:
-    """Whether or not the optimizer is given the frozen half."""
+    """This holds whether or not the optimizer receives the frozen half."""
     model = Foreign(tiny_folder)
     frozen = getattr(model.inner["vlm"].layers[0].up, half)
     frozen.requires_grad_(False)
@@ -410,7 +410,7 @@ def test_a_training_resumes_where_a_half_of_a_map_never_had_a_gradient(
     base: Backbone,
     anchor: Path,
 ) -> None:
-    """It has no state of AdamW's, and what holds the other half has moved it all the same."""
+    """It has no AdamW state, but the protection of the other half has moved it."""
 
     def teach(model: nn.Module, optimizer: torch.optim.Optimizer, steps: range) -> None:
         for seed in steps:
@@ -431,7 +431,7 @@ def test_a_training_resumes_where_a_half_of_a_map_never_had_a_gradient(
 def test_weights_stay_where_a_method_cannot_start(
     tiny_folder: Path, base: Backbone, tmp_path: Path
 ) -> None:
-    """It starts from the base model's, which the weights of a resumed training are not."""
+    """It starts from the base model's weights, which those of a resumed training are not."""
     path = tmp_path / "anchor.safetensors"
     measure.run(
         str(tiny_folder), Anchor(samples=14, batch_size=14, parts=("inputs",), energy=0.5), path
@@ -453,14 +453,14 @@ def test_the_anchor_of_another_model_is_refused(tiny_folder: Path, anchor: Path)
 def test_a_scaler_skips_the_step_of_an_overflow(
     method: str, tiny_folder: Path, base: Backbone, anchor: Path
 ) -> None:
-    """It calls a fused optimizer all the same."""
+    """The scaler calls a fused optimizer even so."""
     model = Foreign(tiny_folder)
     parameters = model.parameters()
     optimizer = ProtectedAdamW(parameters, method, anchor, base, {}, fused=True, **ADAMW)
     train(model, optimizer, range(3))
     before = values(model)
     scaler = torch.amp.GradScaler("cpu", init_scale=8.0)
-    scaler.scale(torch.zeros(()))  # as a loss would be, which begins its work
+    scaler.scale(torch.zeros(()))  # like a loss, which initializes it
     gradients(model, 5)
     model.after.weight.grad.mul_(torch.inf)
     scaler.step(optimizer)
@@ -478,7 +478,7 @@ def test_a_scaler_skips_the_step_of_an_overflow(
 
 @pytest.fixture(scope="module")
 def half_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A VLM whose weights bfloat16 has, as one that was published in it."""
+    """A VLM with weights representable in bfloat16, like one that was published in it."""
     folder = tmp_path_factory.mktemp("half")
     make_tiny().bfloat16().float().save(folder)
     return folder
@@ -495,14 +495,14 @@ def half_anchor(half_folder: Path) -> Path:
 
 
 def half(folder: Path) -> Foreign:
-    """A policy whose VLM is in bfloat16, and whose expert is not."""
+    """A policy with its VLM in bfloat16, but not its expert."""
     model = Foreign(folder)
     model.inner.to(torch.bfloat16)
     return model
 
 
 def train_rounded(model: nn.Module, optimizer: torch.optim.Optimizer, steps: range) -> None:
-    """As `train`, by gradients that bfloat16 has."""
+    """Like `train`, with gradients representable in bfloat16."""
     for seed in steps:
         gradients(model, seed)
         for parameter in model.parameters():
@@ -541,7 +541,7 @@ def test_a_vlm_that_the_program_has_rounded_is_known_as_the_bases(
 def test_half_precise_weights_are_the_rounded_ones_of_a_float32_training(
     method: str, half_folder: Path, half_base: Backbone, half_anchor: Path
 ) -> None:
-    """The step is that of float32 weights, bit for bit; the parameters are these, rounded."""
+    """The step is that of float32 weights, bit for bit; the parameters are their rounded values."""
     narrow, wide = half(half_folder), Foreign(half_folder)
     optimizer = make(narrow, method, half_anchor, half_base)
     train_rounded(narrow, optimizer, range(4))
@@ -584,7 +584,7 @@ def test_steps_that_rounding_would_lose_move_half_precise_weights(
     for _ in range(60):
         weight.grad = torch.ones_like(weight)
         optimizer.step()
-    # Each step is 1e-5, and most weights' neighbours are farther than twice that.
+    # Each step is 1e-5, and for most weights the next bfloat16 is more than twice that away.
     assert (weight != before).float().mean() > 0.5
     moved = optimizer.state[weight]["aegis_master"] - before.float()
     torch.testing.assert_close(moved, torch.full_like(moved, -60e-5), rtol=1e-2, atol=0.0)

@@ -1,4 +1,4 @@
-"""A guard over the VLM in a policy, whose loop calls the parts of the layers itself, as pi0's."""
+"""A guard over the VLM in a policy whose loop calls the parts of the layers itself, as pi0 does."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ EXTRA = 2  # tokens of the action expert
 class Policy(nn.Module):
     """A VLM and an action expert, whose tokens attend to one another in every layer.
 
-    Neither a layer of the VLM nor the VLM itself is called. `note` is given the VLM's hidden states
+    Neither a layer of the VLM nor the VLM itself is called. `note` receives the VLM's hidden states
     after each layer.
     """
 
@@ -53,7 +53,7 @@ class Policy(nn.Module):
 def together(
     layer: Block, own: Block, x: Tensor, actions: Tensor, hidden: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """One layer of both; actions see the VLM's tokens, and those see themselves alone."""
+    """One layer of both; actions attend to the VLM's tokens, which attend only to each other."""
     q, k, v = layer.qkv(layer.norm1(x)).chunk(3, -1)
     r, s, w = own.qkv(own.norm1(actions)).chunk(3, -1)
     x = x + layer.out((q @ k.mT / 4).masked_fill(hidden[:, None], -1e4).softmax(-1) @ v)
@@ -67,7 +67,7 @@ def together(
 
 @pytest.fixture(scope="module")
 def anchors(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """The anchor that each method reads, of the VLM alone."""
+    """The anchor that each method reads, measured on the VLM alone."""
     return anchors_by_method(tmp_path_factory.mktemp("anchors"))
 
 
@@ -101,7 +101,7 @@ def guarded(method: str, anchors: dict[str, Path]) -> tuple[Policy, Guard]:
 def test_noted_hidden_states_are_those_of_the_layers(
     by_number: bool, anchors: dict[str, Path]
 ) -> None:
-    """The VLM's tokens do not see the actions, so they are what the VLM's own pass makes."""
+    """The VLM's tokens do not attend to actions, so they equal those of the VLM's own pass."""
     policy, guard = guarded("aegis", anchors)
     policy.by_number = by_number
     pixels, ids, mask = batch(0)
@@ -185,7 +185,7 @@ def test_layers_that_nobody_notes(anchors: dict[str, Path]) -> None:
 )
 def test_what_is_none_of_the_layers(layer: Any, says: str, anchors: dict[str, Path]) -> None:
     _, guard = guarded("aegis", anchors)
-    guard.note(layer, torch.zeros(1, 2, WIDTH))  # outside a watched pass nothing is looked at
+    guard.note(layer, torch.zeros(1, 2, WIDTH))  # outside a watched pass nothing is checked
     with pytest.raises(AegisError, match=says), guard.watch(None):
         guard.note(layer, torch.zeros(1, 2, WIDTH))
 

@@ -1,4 +1,4 @@
-"""Two guarded processes train one model as one process does with the batches of both."""
+"""Two guarded processes train a model like one process that has the batches of both."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def train_alone(path: Path, parts: int = 1, **options: Any) -> tuple[Tensor, dic
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Path]]:
-    """A folder of what two processes have trained, and the anchors."""
+    """The folder with the results of two processes, and the anchors."""
     folder = tmp_path_factory.mktemp("trained")
     paths = anchors_by_method(folder)
     processes.start(train_together, (str(folder), paths), WORLD)
@@ -74,7 +74,7 @@ def test_processes_do_what_one_does_with_the_batches_of_all(
     assert torch.equal(one, other) and (alone - vector(make())).norm() > 0.1
     torch.testing.assert_close(one, alone, rtol=1e-9, atol=1e-9)
     if method == "aegis":
-        assert (expected["ta"] < 0).any()  # else nothing would have been projected
+        assert (expected["ta"] < 0).any()  # otherwise nothing would have been projected
     for name, values in expected.items():
         assert torch.equal(rows[name], its[name])
         torch.testing.assert_close(rows[name], values, rtol=1e-6, atol=1e-12)
@@ -84,7 +84,7 @@ def test_processes_do_what_one_does_with_the_batches_of_all(
 def test_processes_that_send_each_or_the_last_of_a_steps_passes_do_what_one_does(
     trained: tuple[Path, dict[str, Path]], sends_each: bool
 ) -> None:
-    """Out of buckets, too, that DistributedDataParallel makes anew in the second pass."""
+    """This includes buckets that DistributedDataParallel rebuilds in the second pass."""
     folder, paths = trained
     (one, rows), (other, its) = (
         torch.load(folder / f"aegis-parts-{sends_each}-{rank}.pt") for rank in range(WORLD)
@@ -92,7 +92,7 @@ def test_processes_that_send_each_or_the_last_of_a_steps_passes_do_what_one_does
     alone, expected = train_alone(paths["aegis"], PARTS, layers=LAYERS)
     assert torch.equal(one, other)
     torch.testing.assert_close(one, alone, rtol=1e-9, atol=1e-9)
-    assert (expected["ta"] < 0).any()  # else nothing would have been projected
+    assert (expected["ta"] < 0).any()  # otherwise nothing would have been projected
     for name in ("tt", "ta", "aa", "w2"):
         assert torch.equal(rows[name], its[name])
         torch.testing.assert_close(rows[name], expected[name], rtol=1e-6, atol=1e-12)

@@ -1,4 +1,4 @@
-"""What goes wrong around the guard is one error: found, expected, and what to do."""
+"""Problems around the guard give one error: found, expected, and what to do."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def test_another_number_of_layers(anchor: Path, tmp_path: Path, anchor_file: Pat
     )
     turned = list(model.text.layers)[::-1]
     refused(lambda: Guard(model, anchor, turned), "text.layers.0", "text.layers.1")
-    model = make_tiny()  # the command's anchor does not name layers: width tells
+    model = make_tiny()  # the command's anchor does not name layers: they are recognised by width
     guard = Guard(model, anchor_file, [model.stem.halve[0], model.stem.halve[1]])
     images = torch.zeros(2, 64, 64, 3, dtype=torch.uint8)
 
@@ -141,7 +141,7 @@ def test_nothing_learns(anchor: Path) -> None:
 
 
 class Root(nn.Module):
-    """A normalisation that no language model has: by the largest number."""
+    """A normalisation that no language model has: division by the largest number."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -228,7 +228,7 @@ def test_running_statistics_may_not_move(tmp_path: Path) -> None:
     guard = Guard(model, path, protect=("maps", "norms"), **options)
     with pytest.warns(UserWarning, match=r"buffers of 'vision\.1', as BatchNorm.*module\.eval"):
         guarded_steps(model, guard)
-    guarded_steps(model, guard)  # it is said once
+    guarded_steps(model, guard)  # the warning appears once
 
 
 def test_a_note_may_stay_in_the_policy_when_the_guard_is_gone(anchor: Path) -> None:
@@ -270,7 +270,7 @@ def test_masks(mask: Tensor, image: Tensor | None, words: tuple[str, ...], ancho
     model = make()
     guard = Guard(model, anchor, LAYERS)
     refused(lambda: watched(guard, model, mask, image), *words)
-    guard.backward(watched(guard, model, MASK))  # the guard goes on as if it had not been
+    guard.backward(watched(guard, model, MASK))  # the guard continues as if nothing had happened
 
 
 @pytest.mark.parametrize("scope", ["image", "text", "each"])
@@ -362,7 +362,7 @@ def test_a_batch_in_the_place_of_its_mask(anchor: Path) -> None:
 
 
 def test_a_second_guard_is_refused_before_its_backward_pass(anchor: Path) -> None:
-    """The first one's has freed the graph that both were to go through."""
+    """The first one's pass has freed the graph that both need."""
     model = make()
     one, other = Guard(model, anchor, LAYERS), Guard(model, anchor, LAYERS)
     with one.watch(MASK), other.watch(MASK):
@@ -373,7 +373,7 @@ def test_a_second_guard_is_refused_before_its_backward_pass(anchor: Path) -> Non
 
 @pytest.mark.parametrize("is_automatic", [False, True])
 def test_gradients_that_are_never_cleared(is_automatic: bool, anchor: Path) -> None:
-    """Every step would be made of all batches so far, and the ledger have one row for all."""
+    """Every step would use all batches so far, and the ledger would have one row for all."""
     model = make()
     guard = Guard(model, anchor, LAYERS)
     if is_automatic:
@@ -442,7 +442,7 @@ def test_a_step_past_the_guard_is_refused_before_it_moves_anything(
 
 
 class Odd(Block):
-    """Returns what no layer returns."""
+    """Returns something that no layer returns."""
 
     value: Any = None
 
@@ -516,7 +516,7 @@ def test_a_measurement_is_of_whole_passes_of_the_model_as_it_answers(tmp_path: P
 
 
 def test_maps_whose_rows_are_not_the_tokens() -> None:
-    """Pixels that nobody said are pixels: padding could not be told from them."""
+    """If pixels are not declared as such, they could not be told from padding."""
     model, (pixels, ids, mask) = make(), batch(0)
     found = Guard.measure(model, parts=("inputs",))
 
@@ -526,13 +526,13 @@ def test_maps_whose_rows_are_not_the_tokens() -> None:
 
     refused(lambda: forward(mask), "'vision.0'", "vision=")
     found = Guard.measure(model, parts=("inputs",))
-    forward(torch.ones_like(mask))  # without padding there is nothing to tell
+    forward(torch.ones_like(mask))  # without padding there is nothing to distinguish
     assert "vision.0" in found.anchor().inputs
 
 
 @pytest.mark.parametrize("keep", [True, False])
 def test_a_map_that_reads_one_row_a_text(keep: bool) -> None:
-    """Padding may or may not be in it: nobody can tell."""
+    """Padding may or may not be in it: there is no way to know."""
     model, (_, ids, mask) = make(), batch(0)
     model.pool = nn.Linear(16, 2).double()
     found = Guard.measure(model, parts=("inputs",), vision="vision")

@@ -1,4 +1,4 @@
-"""A model whose layers lie on several devices in one process is guarded as on one."""
+"""A model with layers on several devices in one process is guarded as on one."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from aegis_cli.guard import process_groups
 
 @pytest.fixture(scope="module")
 def apart(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, Any]]:
-    """How far everything is from what it is on one device."""
+    """How far each result is from that on one device."""
     if not POSSIBLE:
         pytest.skip("this torch takes no device of others' making")
     folder = tmp_path_factory.mktemp("spread")

@@ -15,7 +15,7 @@ from aegis_cli.models import structure
 
 
 class Two(nn.Module):
-    """A model of two towers."""
+    """A model with two towers."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -24,7 +24,7 @@ class Two(nn.Module):
 
 
 class Experts(nn.Module):
-    """Blocks with a list of blocks in each."""
+    """Blocks, each with a list of blocks."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -205,7 +205,7 @@ def test_the_names_of_the_sample_are_those_the_tests_use(tmp_path: Path) -> None
 
 
 class Patches(nn.Module):
-    """nanoVLM's: a convolution, and a table of positions that is added to what it makes."""
+    """nanoVLM's: a convolution, and a table of positions that is added to its output."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -214,7 +214,7 @@ class Patches(nn.Module):
 
 
 class Mixing(nn.Module):
-    """A matrix that is no map of torch's: it may multiply what differs by question."""
+    """A matrix that is not in a torch map: it may multiply values that differ by question."""
 
     def __init__(self) -> None:
         super().__init__()

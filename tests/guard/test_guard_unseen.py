@@ -1,4 +1,4 @@
-"""A guard refuses by name, before a step, what it cannot see: it never holds nothing unsaid."""
+"""A guard refuses by name, before a step, what it cannot see: it never fails silently."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def refused(call: Callable[[], object], *words: str) -> None:
 def test_sharded_weights_before_and_after_the_guard(
     anchors: dict[str, Path], tmp_path: Path
 ) -> None:
-    """FSDP2 puts others in the place of the parameters; a guard would see no gradient of theirs."""
+    """FSDP2 replaces the parameters; a guard would never see the gradients of the new ones."""
     processes.start(shard_under_a_guard, (str(tmp_path), anchors), WORLD)
 
 
@@ -112,7 +112,7 @@ def test_freezing_a_part_later_is_no_other_parameter(method: str, anchors: dict[
 
 @every_method
 def test_what_learns_only_later_is_refused(method: str, anchors: dict[str, Path]) -> None:
-    """Its first steps would be taken with nothing held."""
+    """Its first steps would be taken without protection."""
     model = make()
     model.vision.requires_grad_(False)
     own = {"kfac": {"protect": ("maps",)}, "nullspace": {"vision": "vision"}}
@@ -124,14 +124,14 @@ def test_what_learns_only_later_is_refused(method: str, anchors: dict[str, Path]
     automatic = Guard(make(), path, method=method, **METHODS[method]).automatic(mask="mask")
     other = automatic._model
     other.text.layers[0].requires_grad_(False)
-    task_loss(other, 0).backward()  # a part that is frozen later is none
+    task_loss(other, 0).backward()  # a part that is frozen later is not one
 
 
 @pytest.mark.parametrize("method", ["nullspace", "kfac"])
 def test_a_model_that_has_moved_since_the_guard_was_made(
     method: str, anchors: dict[str, Path]
 ) -> None:
-    """The directions that its updates are kept from lie on the other device."""
+    """The directions from which its updates are kept away are on the other device."""
     model, guard = guarded(method, anchors)
     optimizer = torch.optim.SGD(model.parameters(), lr=0.1)
     guard.backward(watched(guard, model))
@@ -145,7 +145,7 @@ def test_a_model_that_has_moved_since_the_guard_was_made(
 
 
 def test_an_anchor_follows_a_model_to_its_device(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The meta device computes nothing, and refuses tensors of any other."""
+    """The meta device computes nothing, and refuses tensors of any other device."""
     monkeypatch.setattr(devices, "reading_stalls", lambda _: True)  # no rows are selected there
     layers = [Moments(4, torch.zeros(3), torch.ones(3)) for _ in range(2)]
     penalty = _penalty(Anchor(layers, layers), "all", "variance", torch.empty(0))
@@ -160,7 +160,7 @@ def test_an_anchor_follows_a_model_to_its_device(monkeypatch: pytest.MonkeyPatch
 def test_processes_that_are_connected_after_the_guard_was_made(
     is_automatic: bool, anchors: dict[str, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As trainers connect them; without a group each process would project by its own gradient."""
+    """As trainers do it; without a group each process would project with its own gradient."""
     model, guard = guarded("aegis", anchors)
     named = Guard(make(), anchors["aegis"], layers=LAYERS, process_group="world")
     if is_automatic:
@@ -208,7 +208,7 @@ def test_a_loss_that_the_model_has_no_part_in(method: str, anchors: dict[str, Pa
 
 
 class Cut(Block):
-    """A layer whose result is cut from its graph, and learns as a leaf of its own."""
+    """A layer whose output is detached from its graph, and learns as a leaf of its own."""
 
     cut = False
 
@@ -220,7 +220,7 @@ class Cut(Block):
 def test_an_anchor_gradient_of_zero_in_every_group(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its ledger would be rows of zeros, and its training the naive one."""
+    """Its ledger would be rows of zeros, and its training the same as naive."""
     model = make(Cut)
     path = measured(model, tmp_path / "anchor.safetensors", parts=("moments",))
     guard = Guard(model, path, LAYERS)
@@ -235,7 +235,7 @@ def test_an_anchor_gradient_of_zero_in_every_group(
 
 @every_method
 def test_a_step_after_a_plain_backward_pass(method: str, anchors: dict[str, Path]) -> None:
-    """As a trainer takes it that knows nothing of the guard beside it."""
+    """As in a trainer that does not know of the guard."""
     model, guard = guarded(method, anchors)
     optimizer, before = torch.optim.SGD(model.parameters(), lr=0.1), vector(model)
     task_loss(model, 0).backward()
@@ -269,7 +269,7 @@ def test_two_optimizers_may_follow_one_guarded_pass(anchors: dict[str, Path]) ->
 def test_two_optimizers_do_not_constrain_twice(
     is_automatic: bool, anchors: dict[str, Path]
 ) -> None:
-    """A proximal step that is taken twice draws back twice as much."""
+    """A proximal step taken twice would draw back twice as far."""
     model, guard = guarded("kfac", anchors)
     if is_automatic:
         guard.automatic(mask="mask")
@@ -302,7 +302,7 @@ def test_an_optimizer_of_other_parameters_constrains_nothing(anchors: dict[str, 
 
 
 def test_a_step_on_zeros_is_no_training(anchors: dict[str, Path]) -> None:
-    """Checkpointing libraries take one, so that the optimizer's state is there to be filled."""
+    """Checkpointing libraries take one to create the optimizer's state before filling it."""
     model, _guard = guarded("aegis", anchors)
     for parameter in model.parameters():
         parameter.grad = torch.zeros_like(parameter)

@@ -1,4 +1,4 @@
-"""A guard on a model with adapters, and on one that others have wrapped: plain names everywhere."""
+"""A guard on a model with adapters, and on wrapped models: plain names everywhere."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ TARGETS = ["qkv", "out", "up", "down"]
 
 @pytest.fixture(scope="module")
 def anchors(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """The anchor that each method reads, of the model alone."""
+    """The anchor that each method reads, measured on the model alone."""
     return anchors_by_method(tmp_path_factory.mktemp("anchors"))
 
 
 def with_lora(model: nn.Module, targets: list[str] = TARGETS, **settings: Any) -> nn.Module:
-    """PEFT's LoRA around a model, in its type."""
+    """PEFT's LoRA around a model, in the model's dtype."""
     peft = pytest.importorskip("peft")
     config = peft.LoraConfig(r=2, lora_alpha=4, target_modules=targets, **settings)
     with torch.random.fork_rng():
@@ -56,7 +56,7 @@ def adapters(model: nn.Module) -> Tensor:
 
 
 def test_a_lora_put_on_before_the_guard_learns_under_it(anchors: dict[str, Path]) -> None:
-    """The anchor is the model's own: a fresh LoRA changes nothing of what was measured."""
+    """The anchor is the model's own: a fresh LoRA does not change what was measured."""
     model = with_lora(make())
     frozen, before = vector(make()), adapters(model)
     guard = Guard(model, anchors["aegis"], LAYERS)
@@ -71,7 +71,7 @@ def test_a_lora_put_on_before_the_guard_learns_under_it(anchors: dict[str, Path]
 
 
 def test_a_lora_with_the_guard_is_what_it_is_without_its_wrapper(anchors: dict[str, Path]) -> None:
-    """PEFT changes the model in place, so that the guard may be given either."""
+    """PEFT changes the model in place, so the guard accepts either."""
     found = []
     for inside in (False, True):
         wrapped = with_lora(make())
@@ -100,7 +100,7 @@ def test_a_lora_put_on_after_the_guard_is_refused(method: str, anchors: dict[str
 
 
 def test_a_model_that_is_frozen_after_the_guard_is_refused(anchors: dict[str, Path]) -> None:
-    """What lies below it, an adapter outside for instance, may still give its states a graph."""
+    """Something below it, such as an adapter outside, may still give its hidden states a graph."""
     model = make()
     guard = Guard(model, anchors["aegis"], LAYERS)
     model.requires_grad_(False)
@@ -122,7 +122,7 @@ def test_a_lora_that_has_learned_is_no_longer_what_was_measured(
 
 
 def test_a_module_that_is_saved_with_the_adapters(anchors: dict[str, Path]) -> None:
-    """PEFT trains a copy of it; an equal copy changes nothing."""
+    """PEFT trains a copy of it; an equal copy makes no difference."""
     model = with_lora(make(), modules_to_save=["norm"])
     guarded_steps(model, Guard(model, anchors["aegis"], LAYERS), steps=1)
     with pytest.raises(AegisError, match="weights and adapters"):
@@ -132,7 +132,7 @@ def test_a_module_that_is_saved_with_the_adapters(anchors: dict[str, Path]) -> N
 def test_nullspace_protects_adapters_that_were_measured(
     anchors: dict[str, Path], tmp_path: Path
 ) -> None:
-    """An adapter is two maps of its own, and what the second reads depends on the first."""
+    """An adapter is two maps of its own, and the second one's inputs depend on the first."""
     options: dict[str, Any] = {"method": "nullspace", "vision": "vision", "energy": 1.0}
     with pytest.raises(AegisError, match="measured without these adapters.*lora_A"):
         Guard(with_lora(make()), anchors["nullspace"], **options)
@@ -153,7 +153,7 @@ def test_nullspace_protects_adapters_that_were_measured(
 
 @pytest.fixture
 def group(tmp_path: Path) -> Iterator[None]:
-    """A process group of this process alone."""
+    """A process group with only this process."""
     dist.init_process_group("gloo", f"file://{tmp_path}/store", rank=0, world_size=1)
     yield
     dist.destroy_process_group()
@@ -176,7 +176,7 @@ def checkpointed(model: Vlm) -> nn.Module:
 
 
 class Policy(nn.Module):
-    """A model that calls a part of its own as some wrappers call theirs."""
+    """A model that calls part of itself like some wrappers call theirs."""
 
     def __init__(self, vlm: nn.Module) -> None:
         super().__init__()
@@ -213,7 +213,7 @@ def test_layers_groups_and_weights_have_their_plain_names(
     guard = Guard(model, anchors["aegis"], LAYERS)
     alone = Guard(make(), anchors["aegis"], LAYERS)
     assert tuple(structure.parameter_groups(model, found)) == alone.ledger.groups
-    if how == "peft" or how == "both":  # the adapters alone learn
+    if how == "peft" or how == "both":  # only the adapters learn
         assert guard.ledger.groups == ("layers.0", "layers.1")
     else:
         assert guard.ledger.groups == alone.ledger.groups
@@ -244,7 +244,7 @@ def test_a_part_that_is_called_as_wrappers_call_theirs_keeps_its_name() -> None:
 
 
 def test_plain_batches_still_train_what_is_checkpointed(anchors: dict[str, Path]) -> None:
-    """The wrapper's own checkpointing is not reentrant, so that the second pass is possible."""
+    """The wrapper's own checkpointing is not reentrant, so the second pass is possible."""
     found = []
     for wrap in (lambda model: model, checkpointed):
         model = wrap(make())

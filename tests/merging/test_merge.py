@@ -52,7 +52,7 @@ Merged = Callable[[str], Path]
 
 @pytest.fixture(scope="module")
 def merged(merge_place: Place, tmp_path_factory: pytest.TempPathFactory) -> Merged:
-    """The run, merged by a method; made once, read only."""
+    """The run, merged by a method; made once, read-only."""
 
     @cache
     def made(method: str) -> Path:
@@ -65,7 +65,7 @@ def merged(merge_place: Place, tmp_path_factory: pytest.TempPathFactory) -> Merg
 
 
 def merging(place: Place, method: str) -> tuple[object, ...]:
-    """The words of the command that `merged` gives."""
+    """The words of the command that `merged` runs."""
     return "merge", place.run, "--method", method, "--strength", STRENGTH, *SMALL, "--json"
 
 
@@ -105,7 +105,7 @@ def test_a_curvature_of_sure_answers_is_warned_of(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """And measured otherwise with a temperature."""
+    """And it is measured differently with a temperature."""
     monkeypatch.setattr(curvature, "_SURE", 100.0)
     kept = []
     for temperature in (1, 4):
@@ -138,7 +138,7 @@ def test_the_expert_stays_and_the_files_say_what_they_were_made_from(
 def test_a_merged_run_shows_what_it_is_and_not_what_it_was_made_of(
     aegis: Aegis, merge: Callable[..., Any], merge_place: Place, tmp_path: Path
 ) -> None:
-    """Its validation loss is the one that the sweep has measured of it."""
+    """Its validation loss is the one that the sweep measured for it."""
     out, given = tmp_path / "merged", ("--method", "linear", "--sweep", "0.999")
     report = merge(merge_place.run, *given, "--max-drop", 0, "--out", out)
     (found,) = (p for p in report["points"] if p["strength"] == report["strength"])
@@ -179,7 +179,7 @@ def test_the_commands_of_a_merged_runs_report_merge_it_so_again(
     commands = json.loads(aegis("report", out, "--json")[1])["commands"]
     assert [line.split()[1] for line in commands[:3]] == ["train", "merge", "probe"]
     assert commands[2].split()[2] == "MERGED_FOLDER"
-    # As somebody types it who has trained again.
+    # As a user types it after training again.
     shutil.copytree(merge_place.run, tmp_path / "NEW_FOLDER", symlinks=True)
     own = {"NEW_FOLDER": f"{tmp_path}/NEW_FOLDER", "MERGED_FOLDER": f"{tmp_path}/again"}
     line = commands[1].replace("DEMOS", str(merge_place.demos))
@@ -200,7 +200,7 @@ def test_the_same_commands_give_the_same_bytes(
     assert code == 0, err
     assert (report["method"], report["strength"], report["points"]) == (method, STRENGTH, [])
     assert 0 < report["kept"] < 1
-    # Their inputs are seen from where they lie.
+    # Their inputs are recorded relative to each of them.
     assert inputs.of(first) == inputs.of(again)
     both = [snapshot(out) for out in (first, again)]
     for found in both:
@@ -225,7 +225,7 @@ def test_a_checkpoint_can_be_merged_too(
 def test_an_empty_folder_may_be_there(
     name: str, merge: Callable[..., Any], merge_place: Place, tmp_path: Path
 ) -> None:
-    """Its name may be as long as a file system takes."""
+    """Its name may be as long as the file system allows."""
     out = tmp_path / name
     out.mkdir()
     merge(merge_place.run, "--method", "linear", "--strength", 0.5, "--out", out)
@@ -271,7 +271,7 @@ def test_a_stronger_merge_keeps_less(
 def test_an_anchor_with_the_part_is_as_good_as_measuring_it(
     method: str, aegis: Aegis, merged: Merged, merge_place: Place, tmp_path: Path
 ) -> None:
-    """But for the eigenvectors, which a file has in float32."""
+    """Except for the eigenvectors, which a file has in float32."""
     words = (*merging(merge_place, method), "--anchor", merge_place.anchor)
     assert aegis(*words, "--out", tmp_path / "given")[0] == 0
     measured, given = parameters(merged(method)), parameters(tmp_path / "given")
@@ -343,7 +343,7 @@ def test_a_gate_that_the_questions_cannot_tell_is_warned_of(
 def test_a_gate_on_questions_that_the_model_never_knew_is_warned_of(
     aegis: Aegis, run_folder: Path, demos_file: Path, tmp_path: Path
 ) -> None:
-    """Untrained, it has nothing to lose, and every strength passes."""
+    """An untrained model has nothing to lose, so every strength passes."""
     given = ("--method", "linear", "--sweep", "1", "--max-drop", 0.5, "--out", tmp_path / "merged")
     code, _, err = aegis("merge", run_folder, "--demos", demos_file, *given, "--questions", 14)
     assert code == 0 and "can hardly lose what it does not know" in " ".join(err.split())
@@ -522,7 +522,7 @@ def test_anchors_and_demonstrations_that_do_not_fit(
     bad(aegis, merge_place.run, "--demos", other, *write, says=("other demonstrations",))
     alone = tmp_path / "alone"
     shutil.copytree(merge_place.run, alone, symlinks=True)
-    (alone / "inputs.json").unlink()  # as of a run that does not say where they lie
+    (alone / "inputs.json").unlink()  # as for a run that does not say where they are
     (tmp_path / "demos.safetensors").unlink()
     before = snapshot(tmp_path)
     bad(aegis, alone, *write, says=("no demonstrations", "--demos"))
@@ -544,7 +544,7 @@ def test_a_merged_run_whose_links_were_followed_is_the_same_run(
 def test_a_merged_run_knows_where_its_inputs_are_seen_from_it(
     merge: Callable[..., Any], merge_place: Place, tmp_path: Path
 ) -> None:
-    """However deep it lies, it may be moved together with them."""
+    """However deeply nested, it may be moved together with them."""
     out = tmp_path / "deep" / "down" / "merged"
     out.parent.mkdir(parents=True)
     merge(merge_place.run, "--method", "linear", "--strength", 0.5, "--out", out)
@@ -570,7 +570,7 @@ def test_a_folder_that_is_not_empty_is_not_replaced(
 def test_what_a_killed_merge_left_keeps_no_other_from_its_folder(
     merge: Callable[..., Any], merge_place: Place, tmp_path: Path
 ) -> None:
-    for name in (".merged.12345.tmp", ".merged.tmp"):  # the second as an earlier Aegis named it
+    for name in (".merged.12345.tmp", ".merged.tmp"):  # the second one is an earlier Aegis' name
         (tmp_path / name / "checkpoints").mkdir(parents=True)
     out = tmp_path / "merged"
     merge(merge_place.run, "--method", "linear", "--strength", 0.5, "--out", out)

@@ -1,4 +1,4 @@
-"""What is measured of a policy on robot frames, and where a merge puts what is no map."""
+"""Measurements of a policy on robot frames, and how a merge handles parameters outside maps."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def half(_: str, moved: Pair, strength: float) -> Pair:
 
 
 def moved_from(base: Backbone) -> Backbone:
-    """Every parameter is another."""
+    """A copy in which every parameter has changed."""
     tuned = copy.deepcopy(base)
     generator = torch.Generator().manual_seed(1)
     with torch.no_grad():
@@ -83,7 +83,7 @@ def test_inputs_are_the_mean_second_moment_of_what_a_map_reads(
 def test_curvature_leaves_out_what_the_task_does_not_depend_on(
     policy: Policy, demos: Demonstrations
 ) -> None:
-    """The expert reads keys and values, so nothing behind the last layer's counts."""
+    """The expert reads keys and values, so nothing after those of the last layer counts."""
     found = task_factors.curvature(policy, demos, FRAMES, flow_samples=2)
     last = f"layers.{policy.backbone.depth - 1}"
     unused = {f"{last}.{part}" for part in ("out", "up", "down")}

@@ -1,4 +1,4 @@
-"""What a new method takes: its file, its name and its options, and nothing else in the package."""
+"""What a new method needs: its file, its name and its options, and no other change."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ train: {{method: {method}, steps: 2, batch_size: 2, warmup: 0}}
 
 
 def trained(package: Path, method: str, backbone: Path, demos: Path, more: str = "") -> Path:
-    """The run of a copy of the package that knows the method."""
+    """The run of a copy of the package that includes the method."""
     recipe, run = package.parent / "recipe.yaml", package.parent / "run"
     recipe.write_text(RECIPE.format(method=method, backbone=backbone) + more)
     done = package_copy.run(package, "aegis_cli", "train", recipe, "--demos", demos, "--out", run)
@@ -79,7 +79,7 @@ def trained(package: Path, method: str, backbone: Path, demos: Path, more: str =
 
 
 def test_the_pages_method_trains(tmp_path: Path, tiny_folder: Path, demos_file: Path) -> None:
-    """A reader does what the page says, and no more than that."""
+    """A reader follows the page, and does nothing else."""
     package = package_copy.copied(tmp_path)
     source = re.search(r"^```python\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
     assert source is not None
@@ -91,7 +91,7 @@ def test_the_pages_method_trains(tmp_path: Path, tiny_folder: Path, demos_file: 
 
 
 def test_a_penalty_needs_no_anchor(tmp_path: Path, tiny_folder: Path, demos_file: Path) -> None:
-    """Any penalty has a second backward pass, and so its inner products in the ledger."""
+    """Any penalty has a second backward pass, so its inner products are in the ledger."""
     package = package_copy.copied(tmp_path)
     (package / "methods" / "away.py").write_text(AWAY)
     package_copy.declare(package, "METHODS", "away")
@@ -103,7 +103,7 @@ def test_a_penalty_needs_no_anchor(tmp_path: Path, tiny_folder: Path, demos_file
 
 @pytest.mark.parametrize("described", [Method, Parts, MethodContext, Pass])
 def test_the_page_names_every_field(described: type) -> None:
-    """What a method may say or use, its author finds on one page."""
+    """A method's author finds everything that it may use on one page."""
     fields = [field.name for field in dataclasses.fields(described)]
     assert fields
     assert [name for name in fields if not re.search(rf"`{name}[`=]", PAGE)] == []
@@ -137,7 +137,7 @@ def test_needs_that_recipes_do_not_know_are_an_error(folder: Path) -> None:
 
 
 def test_every_file_of_a_method_is_known() -> None:
-    """None is forgotten in recipes."""
+    """The recipes list all of them."""
     files = Path(methods.__file__).parent.glob("*.py")
     found = {path.stem for path in files if "\nMETHOD = " in path.read_text(encoding="utf-8")}
     assert found == {name.replace("-", "_") for name in recipes.METHODS}

@@ -1,4 +1,4 @@
-"""The options of AEGIS: tokens compared, groups projected, what the conflict is removed from."""
+"""The options of AEGIS: tokens compared, groups projected, where the conflict is removed."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ Named = Mapping[str, Tensor | None]
 
 
 def make_anchor() -> Anchor:
-    """Image and text tokens of different number, mean and size, and layers that grow."""
+    """Image and text tokens that differ in number, mean and size, and layers that grow."""
     layers = {
         "image": make_moments(DEPTH, WIDTH, seed=1),
         "text": make_moments(DEPTH, WIDTH, seed=2),
@@ -55,7 +55,7 @@ def make_anchor() -> Anchor:
 
 
 def make_pass(seed: int = 0) -> Pass:
-    """Text of different lengths; what stands at padding is huge, and would be seen."""
+    """Text of different lengths; values at padding are huge, so using them would show."""
     generator = torch.Generator().manual_seed(seed)
     mask = torch.ones(BATCH, IMAGE + TEXT, dtype=torch.bool)
     for row, length in enumerate((TEXT, 2, 4, 1)):
@@ -82,7 +82,7 @@ def start(**options: Any) -> Parts:
 
 
 def penalty(seen: Pass, **options: Any) -> tuple[Tensor, Tensor, list[Tensor]]:
-    """The penalty, W2^2 of each layer, and the penalty's gradient by the hidden states."""
+    """The penalty, W2^2 of each layer, and the penalty's gradient in the hidden states."""
     measure = start(**options).penalty
     assert measure is not None
     cost, w2 = measure(seen)
@@ -134,7 +134,7 @@ def test_the_penalty_is_the_distance_of_the_tokens_in_scope(scope: str, weightin
 
 
 def test_scopes_and_weightings_differ() -> None:
-    """Else the comparisons of these tests would show nothing."""
+    """Otherwise the comparisons of these tests would show nothing."""
     seen = make_pass()
     costs = [penalty(seen, scope=s, weighting=w)[0].item() for s in SCOPES for w in WEIGHTINGS]
     assert len({round(cost, 9) for cost in costs}) == len(SCOPES) * len(WEIGHTINGS) == 8
@@ -193,7 +193,7 @@ def test_each_is_the_mean_of_image_and_text(weighting: str) -> None:
 
 
 def task_and_anchor() -> tuple[Named, Named]:
-    """Task and anchor gradients of the backbone, neither bent by the other."""
+    """Task and anchor gradients of the backbone, neither changed by the other."""
     policy = adapt(AEGIS, double_policy(), projects="update")
     anchor = gradients(policy, AEGIS).anchor
     return snapshot_gradients(policy, "backbone."), {
@@ -208,7 +208,7 @@ def bent(**options: Any) -> Named:
 
 
 def difference(x: Tensor | None, y: Tensor | None) -> Tensor:
-    """x - y, a missing one counting as zero."""
+    """x - y; a missing one counts as zero."""
     zero = torch.zeros_like(x if x is not None else y)  # type: ignore[arg-type]
     return (zero if x is None else x) - (zero if y is None else y)
 
@@ -257,7 +257,7 @@ def test_restoration_adds_its_share_of_the_anchor_gradient(groups: str, projects
 
 
 def idle_entries(task: Named) -> dict[str, Tensor]:
-    """Where each task gradient is zero; a missing one is zero everywhere."""
+    """Where each task gradient is zero; a missing gradient is zero everywhere."""
     shapes = {f"backbone.{n}": p for n, p in make_policy().backbone.named_parameters()}
     return {
         name: torch.ones_like(shapes[name], dtype=torch.bool) if g is None else g == 0
@@ -291,7 +291,7 @@ def test_kept_is_orthogonal_to_the_anchor_gradient_of_what_moves() -> None:
         scale = (found.row.tt[i] * found.row.aa[i]).sqrt()
         if found.row.ta[i] < 0:
             assert along_anchor.abs() < 1e-12 * scale
-    assert found.taken.keys() > found.anchor.keys()  # what later steps may reuse is whole
+    assert found.taken.keys() > found.anchor.keys()  # what later steps may reuse is complete
 
 
 @pytest.mark.parametrize("projects", PROJECTED)
@@ -345,7 +345,7 @@ def test_the_weights_of_the_two_gradients(projects: str) -> None:
     for weight in (0.0, 0.3):
         combine = start(projects=projects, restoration=weight).combine
         assert combine is not None
-        task, anchor = combine(tt[:1], ta[:1], aa[:1])  # of one group, as the setting has it
+        task, anchor = combine(tt[:1], ta[:1], aa[:1])  # for one group, as in the setting
         assert task.tolist() == [1.0] and anchor.tolist() == [
             (0.0 if projects == "update" else 0.25) + weight
         ]
@@ -373,7 +373,7 @@ def stepped(
 
 
 def along(names: list[str], now: Named, before: Named, anchor: Named) -> tuple[Tensor, Tensor]:
-    """<D, a> and the cosine of the two."""
+    """<D, a> and the cosine between the two."""
     dd, da, aa = projection.inner(
         [difference(now[n], before[n]) for n in names], [anchor.get(n) for n in names]
     )
@@ -399,14 +399,14 @@ def test_no_applied_update_raises_the_transport_cost(projects: str, decay: float
                 zero = {n: torch.zeros_like(t) for n, t in removed.items()}
                 assert (
                     along(names, removed, zero, found.anchor)[1] > 1 - 1e-9
-                )  # along the anchor gradient, and nothing else
+                )  # along the anchor gradient only
             else:
                 assert all(same_bits(after[n], free[n]) for n in names), group
     assert conflicts == {True, False}
 
 
 def test_an_orthogonal_gradient_alone_gives_an_update_that_conflicts() -> None:
-    """Why the update can be projected too: Adam's scaling and momentum turn the gradient."""
+    """Why the update can also be projected: Adam's scaling and momentum rotate the gradient."""
     policy = adapt(AEGIS, double_policy(), projects="gradient")
     optimizer, cosines = torch.optim.AdamW(policy.parameters(), lr=1e-3, weight_decay=0.0), []
     for _ in range(2):

@@ -46,7 +46,7 @@ def fixed_draws() -> Iterator[None]:
 
 
 def steps(policy: Policy, method: str, count: int = 3) -> None:
-    """AdamW with weight decay, which moves whatever has a gradient."""
+    """AdamW steps with weight decay, which move whatever has a gradient."""
     learning = [p for p in policy.parameters() if p.requires_grad]
     optimizer = torch.optim.AdamW(learning, lr=1e-2, weight_decay=0.1)
     for index in range(count):
@@ -65,7 +65,7 @@ def test_the_experts_loss_gives_the_backbone_no_gradient() -> None:
 
 
 def test_the_backbones_gradient_is_that_of_its_actions_as_text() -> None:
-    """Twice the weight is twice the gradient, and the expert's is as under stop-gradient."""
+    """Twice the weight gives twice the gradient, and the expert's is as under stop-gradient."""
     found = {}
     for weight in (1.0, 2.0):
         policy = adapt(INSULATE, double_policy(), weight=weight)
@@ -85,7 +85,7 @@ def test_the_backbones_gradient_is_that_of_its_actions_as_text() -> None:
 
 @pytest.fixture
 def graphless_casts_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Autocast as it is before torch 2.11: a weight's cast is kept, made without a graph or not."""
+    """Autocast as before torch 2.11: a weight's cast is cached even if made without a graph."""
     casts: dict[int, Tensor] = {}
     linear, clear = F.linear, torch.clear_autocast_cache
 
@@ -137,7 +137,7 @@ def test_the_backbone_learns_to_say_what_is_done() -> None:
     batch = robot_batch()
     seen = Pass(0, None, (), torch.ones(1), torch.ones(1), batch)
     first = auxiliary(seen).item()
-    # An untrained model says any word: near the logarithm of the vocabulary per word, two a number.
+    # An untrained model guesses: about the log of the vocabulary size per word, two words a number.
     assert first == pytest.approx(2 * math.log(len(policy.backbone.tokenizer.vocabulary)), rel=0.5)
     steps(policy, "insulate", count=20)
     assert auxiliary(seen).item() < 0.7 * first
@@ -215,7 +215,7 @@ def test_the_loss_is_in_nats_per_number_that_is_written() -> None:
 
 
 def test_actions_are_asked_for_by_the_prompt() -> None:
-    """A prompt around the instruction is the instruction with those words."""
+    """A prompt around the instruction equals the instruction with those words."""
     policy, batch = make_policy(), robot_batch()
     asked = replace(batch, instructions=[f"arm {text}" for text in batch.instructions])
     losses = []

@@ -1,4 +1,4 @@
-"""kfac on a small module in float64: what learns, what is drawn back, how far maps move."""
+"""kfac on a small float64 module: what learns, what is drawn back, how far maps move."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def fixed_draws() -> Iterator[None]:
 
 
 class Toy(nn.Module):
-    """Two maps and a lone row; a table, a normalisation and a tied head beside them."""
+    """Two maps and a lone row, with a table, a normalisation and a tied head."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -82,7 +82,7 @@ def take_step(toy: nn.Module, optimizer: torch.optim.Optimizer) -> None:
 
 
 def test_linear_maps_and_convolutions_learn() -> None:
-    """A tied head is a table, and does not."""
+    """A tied head is a table, and does not learn."""
     assert kfac.METHOD.needs == {"curvature"} and not kfac.METHOD.compares_layers
     toy = Toy().requires_grad_(False)
     toy.stem = nn.Conv2d(2, 2, 2)
@@ -141,7 +141,7 @@ def move(toy: nn.Module) -> None:
 
 
 def drawn_back(toy: nn.Module, anchor: Anchor, update: Update, **options: Any) -> dict[str, Tensor]:
-    """Where a copy of the toy, moved always alike, is after one constraint."""
+    """The weights of a copy of the toy, always moved alike, after one constraint."""
     context = replace(make_setting(**options), backbone=copy.deepcopy(toy), anchor=anchor)
     constrain = kfac.METHOD.start(context).constrain
     assert constrain is not None
@@ -180,7 +180,7 @@ def test_a_rate_of_zero_still_has_a_weight(growth: float, read: bool) -> None:
 
 
 def test_by_its_gradient_the_penalty_is_added_to_the_tasks() -> None:
-    """sum_ij w h_ij D_ij^2 / 2 has the gradient that an excess of small weight tends to."""
+    """sum_ij w h_ij D_ij^2 / 2 has the gradient to which an excess of small weight tends."""
     context = make_setting(step="gradient")
     toy, origin = context.backbone, values(context.backbone)
     parts = kfac.METHOD.start(context)
@@ -198,7 +198,7 @@ def test_by_its_gradient_the_penalty_is_added_to_the_tasks() -> None:
 
 
 def make_pairs(*sizes: float) -> list[tuple[nn.Parameter, nn.Parameter]]:
-    """Maps whose gradients are so large everywhere."""
+    """Maps whose gradients have these sizes everywhere."""
     pairs = [(nn.Parameter(torch.zeros(3, 2)), nn.Parameter(torch.zeros(3))) for _ in sizes]
     for pair, size in zip(pairs, sizes, strict=True):
         for parameter in pair:
@@ -209,7 +209,7 @@ def make_pairs(*sizes: float) -> list[tuple[nn.Parameter, nn.Parameter]]:
 @pytest.mark.parametrize("scale", [1.0, 1e-12])
 @pytest.mark.parametrize("balance", [0.5, 1.0])
 def test_a_map_learns_the_slower_the_smaller_its_gradient(balance: float, scale: float) -> None:
-    """Weight and bias alike, and whatever the loss's scale."""
+    """Weight and bias alike, at any scale of the loss."""
     large, small, none = pairs = make_pairs(2.0 * scale, 0.5 * scale, 0.0)
     rms = ((4 + 0.25) / 3) ** 0.5  # of all maps' entries together
     found = kfac.shares(dict(zip("abc", pairs, strict=True)), balance)

@@ -38,8 +38,7 @@ DENSE = {
     for n, module in make_tiny().named_modules()
     if isinstance(module, torch.nn.Linear | torch.nn.Conv2d)
 }
-# Every method says here which of the adapted backbone's parameters it trains; a new one adds its
-# line.
+# The parameters of the adapted backbone that each method trains; a new method adds its line.
 TRAINABLE = {
     "naive": EVERYTHING,
     "stop-gradient": set(),
@@ -68,7 +67,7 @@ def train(
     expert_lr: float = 3e-3,
     backbone_lr: float = 3e-3,
 ) -> list[float]:
-    """Losses of `steps` updates on one batch with one noise."""
+    """Losses of `steps` updates on one batch with the same noise."""
     groups = [
         {"params": list(learning(policy).values()), "lr": backbone_lr},
         {"params": list(policy.expert.parameters()), "lr": expert_lr},
@@ -140,7 +139,7 @@ def test_only_what_is_trainable_gets_gradients(method: Method) -> None:
     frozen = {name: p.grad for name, p in policy.backbone.named_parameters() if not p.requires_grad}
     assert all(gradient is None for gradient in frozen.values())
     assert all(p.grad is not None and p.grad.isfinite().all() for p in policy.expert.parameters())
-    # the first layer's outputs reach the second layer's keys, so all of what it trains is moved
+    # the first layer's outputs reach the second layer's keys, so all its trainable weights move
     first = {name: p.grad for name, p in learning(policy).items() if name.startswith("layers.0.")}
     assert all(gradient is not None for gradient in first.values())
     assert bool(first) == bool(TRAINABLE[method.name])
@@ -188,7 +187,7 @@ def test_what_is_frozen_stays_bit_for_bit(method: Method) -> None:
 
 
 def test_the_anchor_is_let_go(method: Method) -> None:
-    """What a method needs of it, it has; the rest would stay in memory for the whole run."""
+    """A method keeps what it needs of it; the rest would stay in memory for the whole run."""
     anchor, policy = (
         replace(make_anchor()),
         make_policy(),
@@ -212,7 +211,7 @@ def test_export_gives_a_plain_model_with_the_same_outputs(method: Method) -> Non
     start = tensors_of(policy.backbone.encode(batch))
     randomize(policy)
     plain, original = export(method, policy), make_tiny()
-    assert (plain is policy.backbone) == (method.name != "lora")  # no copy where nothing was added
+    assert (plain is policy.backbone) == (method.name != "lora")  # no copy if nothing was added
     assert [(n, t.shape) for n, t in plain.state_dict().items()] == [
         (n, t.shape) for n, t in original.state_dict().items()
     ]
@@ -225,7 +224,7 @@ def test_export_gives_a_plain_model_with_the_same_outputs(method: Method) -> Non
     moved = any(not torch.equal(x, y) for x, y in zip(start, adapted, strict=True))
     assert moved == bool(
         TRAINABLE[method.name]
-    )  # else the comparison above would have shown nothing
+    )  # otherwise the comparison above would have shown nothing
 
 
 def test_export_leaves_the_adapted_model_as_it_is(method: Method) -> None:
@@ -271,7 +270,7 @@ def test_lora_changes_the_language_maps_alone(lora_changes: dict[str, torch.Tens
 def test_lora_changes_have_the_rank_asked_for(lora_changes: dict[str, torch.Tensor]) -> None:
     singular = torch.linalg.svdvals(lora_changes["layers.0.qkv.weight"])
     assert (singular[int(LORA["rank"]) :] < 1e-12 * singular[0]).all()
-    assert singular[int(LORA["rank"]) - 1] > 1e-6 * singular[0]  # and no less is used
+    assert singular[int(LORA["rank"]) - 1] > 1e-6 * singular[0]  # and the full rank is used
 
 
 def test_lora_is_scaled_by_alpha_over_rank() -> None:

@@ -32,7 +32,7 @@ from aegis_cli.training import step
 
 STEPS = 16
 KINDS = ("maps", "norms", "embeddings", "stem")
-PIXELS = 16  # four image tokens, so that two questions do not span what the maps can read
+PIXELS = 16  # four image tokens, so that two questions do not span all possible inputs of the maps
 ASKED = (
     Question("color", "what color is the cube", "red"),
     Question("count", "count the objects", "two"),
@@ -89,7 +89,7 @@ def scores(policy: Policy) -> Tensor:
 
 
 def constrain(parts: Parts, policy: Policy, optimizer: torch.optim.Optimizer) -> None:
-    """The optimizer's step as `parts` want it."""
+    """The optimizer's step under the constraint of `parts`."""
     before = snapshot((n, p) for n, p in policy.backbone.named_parameters() if p.requires_grad)
     if parts.begin is not None:
         parts.begin()
@@ -99,9 +99,9 @@ def constrain(parts: Parts, policy: Policy, optimizer: torch.optim.Optimizer) ->
 
 
 def fit(policy: Policy, parts: Parts) -> list[float]:
-    """Action losses of steps of the backbone alone, on one batch with one noise.
+    """Action losses while only the backbone learns, on one batch with the same noise.
 
-    With weight decay and clipping.
+    The steps use weight decay and clipping.
     """
     learning = list(policy.backbone.parameters())
     optimizer = torch.optim.AdamW(learning, lr=3e-3, weight_decay=0.3)
@@ -207,7 +207,7 @@ def test_one_kind_left_out_is_enough_to_change_them(kind: str) -> None:
 
 
 def share_after(name: str, energy: float, steps: int = 2) -> tuple[Policy, float]:
-    """A policy in float64 after some steps of a method, and the protected share of what moved."""
+    """A float64 policy after some steps of a method, and the protected share of its movement."""
     policy = double_policy()
     adapt(METHODS[name], policy, **({"energy": energy} if name == "nullspace" else {}))
     learning = [p for p in policy.parameters() if p.requires_grad]

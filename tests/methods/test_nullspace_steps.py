@@ -52,7 +52,7 @@ def start(
 
 
 def train(toy: nn.Module, parts: Parts, optimizer: str, data: Inputs, steps: int = STEPS) -> None:
-    """Fit the outputs on `data` to targets that lie far away, as methods constrain it."""
+    """Fit the outputs on `data` to distant targets, under the method's constraint."""
     learning = dict(toy.named_parameters())
     make, clip = OPTIMIZERS[optimizer]
     stepper, target = make(list(learning.values())), 3 * fixed(*toy(*data).shape)
@@ -77,13 +77,13 @@ def test_protected_inputs_keep_their_outputs_and_others_do_not(case: Case, optim
     assert (toy(*other) - other_said).abs().max() > 1e-2
     free = (
         case.model()
-    )  # without protection these steps would have changed what protected inputs get
+    )  # without protection these steps would have changed the outputs of protected inputs
     train(free, Parts(), optimizer, case.any())
     assert (free(*protected) - said).abs().max() > 1e-2
 
 
 def test_projecting_the_gradient_alone_would_not_do(case: Case) -> None:
-    """Adam and weight decay lead a projected gradient back, so the applied update is projected."""
+    """Adam and weight decay bring the removed part back, so the applied update is projected."""
     toy = case.model()
     protection = protection_of(case, case.vqa(), energy=1.0)
     stepper = torch.optim.AdamW(toy.parameters(), lr=0.02, weight_decay=2.0)
@@ -131,7 +131,7 @@ def test_full_rank_inputs_at_share_one_freeze_the_map(
 
 
 class Two(nn.Module):
-    """A map of a protected kind beside one of another kind; both read the same."""
+    """A map of a protected kind beside one of another kind; both read the same inputs."""
 
     def __init__(self, toy: Toy) -> None:
         super().__init__()

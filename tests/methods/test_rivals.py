@@ -22,7 +22,7 @@ GROUPS = (
     "stem",
     "embeddings",
     "final_norm",
-)  # in a backbone's order, not in depth's
+)  # in a backbone's order, which is not by depth
 WIDTH, BATCH, TOKENS = 4, 3, 5
 
 
@@ -34,7 +34,7 @@ def fixed_draws() -> Iterator[None]:
 
 
 class Toy(nn.Module):
-    """Two layers on embedded tokens; `final_norm` is not on the way to the hidden states."""
+    """Two layers on embedded tokens; `final_norm` does not affect the hidden states."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -86,7 +86,7 @@ def draw_like(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 
 def make_fisher(context: MethodContext) -> dict[str, Tensor]:
-    """Values of very different sizes between parameters, as in a Fisher information."""
+    """Values that differ greatly in size between parameters, as in a Fisher information."""
     return {
         n: torch.rand_like(p.detach()) * 10.0**-i
         for i, (n, p) in enumerate(context.backbone.named_parameters())
@@ -302,11 +302,11 @@ def test_ewc_refuses_a_fisher_information_that_says_nothing(value: float) -> Non
 
 
 class Stepped:
-    """A step by hand from `before` to `free`, which MAPS turns into `after`.
+    """A step by hand from `before` to `free`, which MAPS changes into `after`.
 
-    Gradients point `sign` x outwards.
+    Gradients point outwards, times `sign`.
 
-    A gradient that points outwards leads descent back to the origin: that is where SPD looks.
+    Under an outward gradient, descent leads back to the origin, which is the direction SPD checks.
     """
 
     def __init__(self, weight: float, *, sign: float = 1.0, growth: float = 0.2) -> None:
@@ -317,7 +317,7 @@ class Stepped:
         move(context)
         self.before = values(context)
         outwards = {name: t - self.origin[name] for name, t in self.before.items()}
-        with torch.no_grad():  # on by `growth`, and a little sideways
+        with torch.no_grad():  # further by `growth`, and a little sideways
             for name, parameter in context.backbone.named_parameters():
                 parameter += growth * outwards[name] + 0.02 * torch.randn_like(parameter)
         self.free = values(context)
@@ -329,7 +329,7 @@ class Stepped:
         return {name: (t - self.origin[name]).norm().item() for name, t in tensors.items()}
 
     def kept(self) -> dict[str, float]:
-        """Share of the way from the origin that is left of each parameter's step."""
+        """Share of the distance from the origin that is left of each parameter's step."""
         after, free = self.distances(self.after), self.distances(self.free)
         return {name: after[name] / free[name] for name in after}
 
@@ -412,7 +412,7 @@ def test_maps_ends_between_the_step_and_the_distance_before_it(weight: float) ->
     )
     assert all(before[name] < free[name] for name in free)
     assert all(before[name] - 1e-12 <= after[name] <= free[name] for name in free)
-    # of the way out, each group keeps 1 - lambda_k
+    # of the distance from the origin, each group keeps 1 - lambda_k
     strengths = maps.schedule(stepped.context.groups, weight)
     for name in free:
         kept = (after[name] - before[name]) / (free[name] - before[name])
@@ -447,7 +447,7 @@ def test_maps_stays_between_the_pre_trained_weights_and_the_step(weight: float) 
         torch.testing.assert_close(
             stepped.after[name], stepped.origin[name] + share * way, rtol=1e-9, atol=1e-12
         )
-    if weight == 1e6:  # so strong that the first module is back where it began, and not beyond
+    if weight == 1e6:  # so strong that the first module is back at its start, and not beyond
         assert stepped.kept()["stem.weight"] < 1e-12
 
 
@@ -514,7 +514,7 @@ def test_distill_falls_under_descent_and_its_teacher_does_not_move() -> None:
         losses.append(loss.item())
     assert all(b < a for a, b in zip(losses, losses[1:]))
     assert 0 < losses[-1] < 0.5 * losses[0]
-    # the teacher still says what it said: its hidden states are those from before
+    # the teacher is unchanged: its hidden states are those from before
     assert auxiliary(replace(first, hidden=taught)).item() == 0
 
 
@@ -572,7 +572,7 @@ def test_distill_teaches_what_the_backbone_was_when_it_started() -> None:
     auxiliary(see(context, draw_inputs())).backward()
     assert list(map(id, context.backbone.parameters())) == list(
         map(id, parameters)
-    )  # the copy is not among what is trained or saved
+    )  # the copy is neither trained nor saved
     assert all(p.requires_grad for p in parameters)
 
 

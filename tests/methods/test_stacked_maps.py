@@ -1,6 +1,6 @@
-"""`kfac` and `nullspace` treat maps of one shape at once where to start a product takes longest.
+"""`kfac` and `nullspace` batch maps of one shape if launching a product takes longest.
 
-The choice is by the device; here the CPU is taken for such a one.
+The device decides this; here the CPU is treated as such a device.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ LAYERS = ("a", "b", "c")
 
 
 class Toy(nn.Module):
-    """Three maps, one of them without a bias, two normalisations, a convolution and a lone row."""
+    """Three maps, one of them without bias, two normalisations, a convolution and a lone row."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -50,7 +50,7 @@ def rows(width: int) -> Tensor:
 
 
 def make_anchor() -> Anchor:
-    """Of maps with unlike numbers of directions."""
+    """An anchor of maps with different numbers of directions."""
     inputs = {name: decompose(second_moment(with_one(rows(WIDTH)))) for name in LAYERS}
     inputs["b"] = decompose(second_moment(with_one(rows(WIDTH)[:2])))
     inputs["c"] = decompose(second_moment(rows(WIDTH)))  # has no bias
@@ -62,7 +62,7 @@ def make_anchor() -> Anchor:
 
 
 def trained(method: str, options: dict[str, Any], together: bool) -> tuple[Toy, list[int]]:
-    """A toy after some constrained steps, and how many maps each group had."""
+    """A toy after some constrained steps, and the number of maps in each group."""
     found = METHODS[method]
     counts: list[int] = []
     stack = stacking.stacked

@@ -1,4 +1,4 @@
-"""Which steps a constraint covers, and what it is told of them."""
+"""Which steps a constraint covers, and what it is told about them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from aegis_cli.methods.stepper import Stepper
 
 
 def make(every: int, compares: bool = True) -> tuple[nn.Linear, Stepper, list[Update]]:
-    """A map whose weights count its steps, and the updates that its constraint has seen."""
+    """A map whose weights count its steps, and the updates passed to its constraint."""
     model, seen = nn.Linear(1, 1, bias=False), list[Update]()
     nn.init.zeros_(model.weight)
     parts = Parts(constrain=seen.append, compares=compares, every=every)
@@ -35,7 +35,7 @@ def anchor(number: int) -> dict[str, Tensor]:
 
 
 def take(model: nn.Linear, stepper: Stepper, first: int, last: int) -> None:
-    """The steps of these numbers, both included."""
+    """Take the steps with these numbers, both included."""
     for number in range(first, last + 1):
         stepper.step(number, moving(model), anchor(number))
 
@@ -64,7 +64,7 @@ def test_it_is_told_what_the_last_step_had_left_of_the_rate() -> None:
 
 
 def test_steps_that_move_nothing_do_not_count() -> None:
-    """Nor is the rate that they had told."""
+    """Their learning rates do not count either."""
     model, stepper, seen = make(every=2)
     for number, (moves, left) in enumerate(
         zip((1, 1, 1, 0, 0, 0), (1, 0.8, 0.6, 0.4, 0.2, 0.1)), 1
@@ -76,7 +76,7 @@ def test_steps_that_move_nothing_do_not_count() -> None:
 
 
 def test_settling_moves_no_later_turn() -> None:
-    """A checkpoint between two turns leaves the turns where they are."""
+    """A checkpoint between two turns does not shift the turns."""
     model, stepper, seen = make(every=3)
     take(model, stepper, 1, 2)
     stepper.settle()

@@ -39,7 +39,7 @@ def prefix() -> KeyValue:
 
 
 def own_allowed() -> Tensor:
-    """A causal mask [B, N, S, S] bool with one key more forbidden.
+    """A causal mask [B, N, S, S] bool that forbids one more key.
 
     Only its own query may read the first key of every second block.
     """
@@ -133,7 +133,7 @@ def test_blocks_do_not_see_each_other(query: Tensor, own: KeyValue, prefix: KeyV
 
 
 def test_a_masked_prefix_counts_for_nothing(query: Tensor, own: KeyValue, prefix: KeyValue) -> None:
-    """Exactly, in float32 as well: exp of the mask underflows to 0."""
+    """The result is exactly equal, in float32 too: exp of the mask underflows to 0."""
     query, own, prefix = (
         query.float(),
         KeyValue(*(x.float() for x in own)),

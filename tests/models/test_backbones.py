@@ -95,7 +95,7 @@ def test_every_parameter_is_in_exactly_one_group(backbone: Backbone) -> None:
 
 
 def test_every_parameter_is_of_exactly_one_site(backbone: Backbone) -> None:
-    """A module's, or a lone row that is a site itself; what takes no part is of none."""
+    """A module's, or a lone row that is a site itself; unused parameters belong to none."""
     sites, modules = backbone.sites(), backbone.site_modules()
     of_modules = [p for module in modules.values() for p in module.parameters(recurse=False)]
     owned = of_modules + [backbone.get_parameter(site) for site in sites if site not in modules]

@@ -1,4 +1,4 @@
-"""The name by which a module is given its cache is the one that its forward was written with."""
+"""A module's cache argument has the name with which its forward was written."""
 
 from __future__ import annotations
 

@@ -41,7 +41,7 @@ Made, Command = Callable[[str], Path], Callable[..., Any]
 
 
 def recorded(count: int = 5) -> list[NewEpisode]:
-    """Episodes of two cameras, the wrist's pictures smaller."""
+    """Episodes with two cameras; the wrist's pictures are smaller."""
     made, small_ones = (
         episodes(count, ("top", "wrist"), (16, 24)),
         episodes(count, ("wrist",), (12, 12), seed=1),
@@ -138,7 +138,7 @@ def settings(model: Path, folder: Path, **changes: Any) -> Recipe:
 def run(
     tmp_path_factory: pytest.TempPathFactory, folder: Path, hf_folder: Made, hf_anchor: Made
 ) -> Path:
-    """A finished run of `aegis` on SmolVLM2 with both cameras; read only."""
+    """A finished run of `aegis` on SmolVLM2 with both cameras; read-only."""
     out = tmp_path_factory.mktemp("runs") / "run"
     report = train.run(
         settings(hf_folder("smolvlm"), folder), "aegis", folder, hf_anchor("smolvlm"), out
@@ -180,7 +180,7 @@ def test_the_policy_is_compared_with_what_both_have_seen(run: Path, folder: Path
 def test_other_sizes_are_evaluated_in_those_of_training_as_a_deployed_policy_sees_them(
     smooth: bool, run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of pictures that are decoded beforehand, and of videos that are decoded as they are read."""
+    """For pictures that are decoded beforehand, and for videos that are decoded on demand."""
     made = episodes(2, BOTH, (40, 30), smooth=smooth)
     known = [dataclasses.replace(e, instruction="go to the red pad") for e in made]
     data = save(tmp_path / "d", known, as_video=smooth)
@@ -201,7 +201,7 @@ def test_other_sizes_are_evaluated_in_those_of_training_as_a_deployed_policy_see
 
 
 def _one_noise(policy: Policy, frames: int, _: torch.Generator) -> torch.Tensor:
-    """The same noise for each frame, whoever asks and however often."""
+    """The same noise for each frame, whoever asks for it and however often."""
     size = policy.expert.shape.chunk, len(policy.action_scale.mean)
     return torch.randn(size, generator=torch.Generator().manual_seed(0)).expand(frames, *size)
 
@@ -303,7 +303,7 @@ def test_of_one_camera_that_nobody_has_named_nothing_is_said(
 def test_through_the_command_line(
     folder: Path, hf_folder: Made, tmp_path: Path, aegis: Command
 ) -> None:
-    """What a user types: a list after --set; --dry-run says what each prompt shows."""
+    """The command that a user types: a list after --set; --dry-run says what each prompt shows."""
     path = tmp_path / "small.yaml"
     path.write_text(
         f"name: small\nbackbone: {hf_folder('qwen2_5_vl')}\ntrain: {{steps: 2, batch_size: 2, "

@@ -73,7 +73,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Images of several sizes, ten a class and part."""
+    """Images of several sizes, ten per class and part."""
     root = tmp_path_factory.mktemp("data")
     rng = np.random.default_rng(0)
     for part, count in (("train", 10), ("test", 4)):
@@ -122,7 +122,7 @@ def test_features_are_the_models_own(folder: Path) -> None:
     assert torch.allclose(found, own.logits_per_image, atol=1e-4)
     assert (
         found.std() > 0.01
-    )  # the towers tell images and texts apart, so that equality says something
+    )  # the towers distinguish images and texts, so equality means something
 
 
 @torch.no_grad()
@@ -170,7 +170,7 @@ def test_sites_are_the_mlp_and_attention_output_maps_of_both_towers(folder: Path
         "mlp.fc1",
         "mlp.fc2",
     }
-    for name, module in sites.items():  # each is really in the path from input to feature
+    for name, module in sites.items():  # each is really on the path from input to feature
         (
             encoder.image_features(encoder.pixels(_images(1)))
             if "vision" in name
@@ -215,7 +215,7 @@ def test_images_are_cut_as_the_models_processor_cuts_them(folder: Path, dataset:
 def test_a_folder_becomes_a_task(dataset: Path) -> None:
     task = folders.load(dataset, "animals", SIZE)
     assert task.classes == CLASSES and task.templates == (folders.TEMPLATE,)
-    # The encoder that ships can read it, with words that it knows.
+    # The shipped encoder can read it, with words that it knows.
     load_dual(EMBEDDED_DUAL).tokenizer.encode(folders.TEMPLATE.format("circle"))
     assert (len(task.test), len(task.train) + len(task.validation)) == (12, 30) and len(
         task.validation
@@ -230,7 +230,7 @@ def test_a_folder_becomes_a_task(dataset: Path) -> None:
 
 
 def told(encoder: Path, root: Path) -> list[str]:
-    """What a stream of the folder's task warns of before it trains."""
+    """The warnings about a stream of the folder's task before training."""
     heard: list[Event] = []
     where = {"encoder": str(encoder), "path": str(root)}
     made = StreamRecipe(name="own", stream="own", order=("animals",), **where)
@@ -280,7 +280,7 @@ def test_an_images_part_does_not_depend_on_the_others(dataset: Path, tmp_path: P
 
 
 def shortened(dataset: Path, out: Path, images: dict[str, int]) -> Path:
-    """A copy of which so many training images of these classes are left."""
+    """A copy in which this many training images of these classes remain."""
     root = shutil.copytree(dataset, out)
     for name, count in images.items():
         for path in sorted((root / "animals" / "train" / name).iterdir())[count:]:
@@ -292,7 +292,7 @@ def shortened(dataset: Path, out: Path, images: dict[str, int]) -> Path:
 def test_something_of_every_class_is_left_to_learn_from(
     first: int, dataset: Path, tmp_path: Path
 ) -> None:
-    """Whichever image a class has, and also where all others have one, too."""
+    """Whichever image a class has, and also if all other classes have a single one."""
     root = shortened(dataset, tmp_path / "copy", {"red_fox": 1, "tabby_cat": 1})
     for name in ("red_fox", "tabby_cat"):
         (only,) = (root / "animals" / "train" / name).iterdir()
@@ -314,14 +314,14 @@ def test_one_image_of_each_class_leaves_none_to_validate_on(dataset: Path, tmp_p
 
 @pytest.mark.parametrize("place", [".thumbnails/00.png", "close/.cache/00.png", ".00.png"])
 def test_hidden_files_and_folders_hold_no_images(place: str, dataset: Path, tmp_path: Path) -> None:
-    """They are some program's own, such as small copies of the images."""
+    """They belong to some program, such as thumbnails of the images."""
     root = shutil.copytree(dataset, tmp_path / "copy")
     kept = root / "animals" / "test" / "zebra"
     (kept / place).parent.mkdir(parents=True, exist_ok=True)
     shutil.copy(kept / "00.png", kept / place)
     assert len(folders.load(root, "animals", SIZE).test) == 12
     (kept / "close").mkdir(exist_ok=True)
-    shutil.copy(kept / "00.png", kept / "close" / "00.png")  # a plain folder's are read
+    shutil.copy(kept / "00.png", kept / "close" / "00.png")  # those of a plain folder are read
     assert len(folders.load(root, "animals", SIZE).test) == 13
 
 
@@ -463,7 +463,7 @@ def test_a_text_that_is_too_long_is_refused(folder: Path) -> None:
 
 @pytest.fixture(scope="module")
 def mtil_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The eleven data sets, each with two classes of a colour of its own and few images."""
+    """The eleven data sets, each with two classes of a distinct colour and few images."""
     root = tmp_path_factory.mktemp("mtil")
     rng = np.random.default_rng(1)
     for name in mtil.TEMPLATES:

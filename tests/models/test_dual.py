@@ -1,6 +1,6 @@
-"""What every dual encoder keeps to, tested on the embedded one.
+"""The contract of every dual encoder, tested on the embedded one.
 
-Features lie on the unit sphere, and each depends on its own input alone.
+Features lie on the unit sphere, and each depends only on its own input.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def test_pixels_are_what_bytes_say(dual: EmbeddedDual) -> None:
 @torch.no_grad()
 @pytest.mark.parametrize("seed", range(3))
 def test_a_feature_does_not_depend_on_the_batch(dual: EmbeddedDual, seed: int) -> None:
-    """Nor on its order, nor, for a text, on how far others make it be padded."""
+    """Nor on its order, nor, for a text, on how much padding the others require."""
     order = torch.randperm(6, generator=torch.Generator().manual_seed(seed))
     pixels = dual.pixels(random_images(6, seed))
     together = dual.image_features(pixels)
@@ -188,9 +188,9 @@ def test_a_backbone_is_no_dual_encoder(
 def test_zero_shot_accuracy_is_the_share_of_pictures_named_right(
     dual: EmbeddedDual, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Features in several batches are those of one picture at a time.
+    """Features from several batches equal those from one picture at a time.
 
-    The labels are what it says for all but three of eleven.
+    The labels are the encoder's own answers except for three of eleven.
     """
     monkeypatch.setattr(zero_shot, "BATCH", 4)
     images, classes, templates = random_images(11), ("red", "blue", "size"), ("a {} cube", "{}")

@@ -1,4 +1,4 @@
-"""What the embedded VLM promises beyond the contract of every backbone."""
+"""The properties of the embedded VLM beyond the contract of every backbone."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def next_word(model: EmbeddedVLM, frame: Tensor, question: str, said: list[int])
 
 
 def test_a_question_is_read_both_ways(embedded: EmbeddedVLM) -> None:
-    """An instruction's first word knows its last, and the expert reads every token's keys."""
+    """An instruction's first word depends on its last, and the expert reads every token's keys."""
     first, second = (
         encode(embedded, images(1), [f"is there a red {shape}"]) for shape in ("ball", "cube")
     )
@@ -98,7 +98,7 @@ def test_packed_questions_score_as_each_alone(embedded: EmbeddedVLM) -> None:
 
 
 def test_an_answer_never_sees_its_own_future(embedded: EmbeddedVLM) -> None:
-    """Teacher forcing scores a word from those before it, with the whole answer in the block."""
+    """With teacher forcing, a word is scored from those before it, with all words in the block."""
     prompt = embedded.tokenizer.prompt(TEXTS[0])
     red, blue = (
         torch.tensor([[[*prompt, *embedded.tokenizer.encode(f"two {color}")]]])
@@ -116,7 +116,7 @@ def test_an_answer_ends_at_its_end(embedded: EmbeddedVLM) -> None:
     red, blue = embedded.tokenizer.encode("red blue")
     assert embedded.tokenizer.decode([red, embedded.tokenizer.end, blue]) == "red"
     assert embedded.tokenizer.decode([embedded.tokenizer.end, blue]) == ""
-    with torch.no_grad():  # a model that has nothing to say
+    with torch.no_grad():  # a model that answers nothing
         embedded.final_norm.bias.copy_(100 * embedded.words.weight[embedded.tokenizer.end])
     assert embedded.answer(images(4), TEXTS) == [""] * 4
 
@@ -129,7 +129,7 @@ def test_the_longest_text_fits(embedded: EmbeddedVLM) -> None:
     assert embedded.answer_log_likelihood(images(1), [question], ["red cube"]).isfinite().all()
 
 
-# While it traces a graph, torch.compile looks at a field that PyTorch warns of.
+# While tracing a graph, torch.compile accesses a field for which PyTorch warns.
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf")
 def test_texts_of_every_length_share_what_is_compiled(embedded: EmbeddedVLM) -> None:
     made = {"backbone": 0, "expert": 0}

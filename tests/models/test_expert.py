@@ -1,4 +1,4 @@
-"""The action expert over grouped and rotated keys: what holds whatever the weights."""
+"""The action expert over grouped and rotated keys: properties that hold for any weights."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def ask(
 
 
 def angles(positions: Tensor) -> Rotation:
-    """[B, S] -> cosines and sines of every position, as rotary embeddings have them."""
+    """[B, S] -> cosines and sines of every position, as in rotary embeddings."""
     angle = positions[..., None].double() / 100 ** (torch.arange(SIZE // 2) / (SIZE // 2))
     both = torch.cat([angle, angle], dim=-1)
     return Rotation(both.cos(), both.sin())
@@ -76,9 +76,9 @@ def test_grouped_queries_are_those_over_repeated_keys(kv_heads: int) -> None:
 
 
 def test_only_the_distance_to_the_prefix_counts() -> None:
-    """Keys rotated from position s on, and actions after them, give the same for every s.
+    """Keys rotated from position s on, followed by actions, give the same result for every s.
 
-    Actions elsewhere do not.
+    With actions at other positions, the result changes.
     """
     model, plain = expert(2), prefix(2)
 
@@ -109,7 +109,7 @@ def test_a_rotation_turns_pairs_of_channels_by_their_angle() -> None:
 
 
 def test_each_layer_has_its_own_view_of_the_prefix() -> None:
-    """What no action token of any layer sees changes nothing; what one layer sees does."""
+    """A token that no layer's actions see changes nothing; one that one layer sees does."""
     model, keys = expert(None), prefix(HEADS)
     generator = torch.Generator().manual_seed(4)
     masks = tuple(torch.rand(BATCH, CHUNK, PREFIX, generator=generator) < 0.7 for _ in range(2))

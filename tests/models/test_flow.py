@@ -74,7 +74,7 @@ def test_the_target_is_the_derivative_of_the_path(ends: tuple[Tensor, Tensor]) -
 
 
 def test_a_straight_field_is_integrated_exactly() -> None:
-    """The conditional field eps - a is constant in time, so any number of steps will do."""
+    """The conditional field eps - a is constant in time, so any number of steps is exact."""
     actions, noise = (
         torch.randn(3, 4, 2, generator=generator(s), dtype=torch.float64) for s in (1, 2)
     )

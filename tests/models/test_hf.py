@@ -31,7 +31,7 @@ from aegis_cli.models.backbones.prompting import Processors
 
 Loaded = Callable[[str], HFBackbone]  # by a family's name
 SAID = ["red", "two", "x3 y5", ""]
-MAX_ANSWER = 10  # tokens that a model may say here, fewer than usual
+MAX_ANSWER = 10  # tokens that a model may generate here, fewer than usual
 
 
 @pytest.fixture(autouse=True)
@@ -50,7 +50,7 @@ def backbone(family: str, hf_backbone: Loaded) -> HFBackbone:
 
 
 class Native:
-    """The same folder as a user of transformers has it: one question at a time, no padding."""
+    """The same folder as transformers runs it for a user: one question at a time, no padding."""
 
     def __init__(self, family: str, folder: Path) -> None:
         self.family = family
@@ -97,7 +97,7 @@ def test_every_known_family_is_tested() -> None:
 def test_answers_are_what_generate_says_token_for_token(
     native: Native, backbone: HFBackbone, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Although here the questions are padded to one batch."""
+    """This holds although the questions are padded to one batch here."""
     said: list[list[int]] = []
     decode = backbone._prompter.decode
     monkeypatch.setattr(
@@ -117,7 +117,7 @@ def test_answers_are_what_generate_says_token_for_token(
 def test_an_answer_may_be_as_long_as_its_reference(
     native: Native, backbone: HFBackbone, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """And by one token longer: what goes on after the reference is not equal to it."""
+    """It may be one token longer, since an answer that goes on does not equal the reference."""
     frame, text, tokenizer = images(1), TEXTS[0], native.processor.tokenizer
     out = native.generate(frame[0], text, 2 * MAX_ANSWER)
     said = out.sequences[0, native.inputs(frame[0], text)["input_ids"].shape[1] :].tolist()
@@ -133,7 +133,7 @@ def test_an_answer_may_be_as_long_as_its_reference(
 def test_likelihoods_are_those_of_generate(
     tokens: int, native: Native, backbone: HFBackbone, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The likelihood of what `generate` says, with an end after it, is that of its own scores.
+    """The likelihood of an answer of `generate` and its end equals that of its own scores.
 
     So every mask and position is right.
     """
@@ -163,7 +163,7 @@ def test_any_of_several_ends_ends_an_answer(backbone: HFBackbone) -> None:
 def test_what_fills_a_row_that_has_ended_is_a_word_of_the_model(
     backbone: HFBackbone, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Another row's answer goes on meanwhile."""
+    """Another row's answer continues meanwhile."""
     said: list[list[int]] = []
     decode = backbone._prompter.decode
     monkeypatch.setattr(backbone._prompter, "decode", lambda ids: said.extend(ids) or decode(ids))
@@ -180,7 +180,7 @@ def test_what_fills_a_row_that_has_ended_is_a_word_of_the_model(
 
 
 def test_every_mask_takes_a_byte_a_number(backbone: HFBackbone) -> None:
-    """That of pixels is as large as the pictures themselves."""
+    """The mask of pixels is as large as the pictures themselves."""
     batch = backbone.process(images(2), TEXTS[:2])
     masks = [tensor for name, tensor in batch.extra.items() if name.endswith("attention_mask")]
     assert all(mask.dtype == torch.bool for mask in (batch.mask, *masks))
@@ -206,7 +206,7 @@ def test_splitting_is_switched_off_where_the_docs_say(
     hf_folder: Callable[[str], Path],
     tmp_path: Path,
 ) -> None:
-    """By how many images are made of one."""
+    """It is measured by how many images are made of one."""
     pictures, found = [torch.zeros(480, 640, 3, dtype=torch.uint8)], []
     for name, changes in (("splits", splits), ("whole", splits | whole)):
         folder = tmp_path / name
@@ -219,7 +219,7 @@ def test_splitting_is_switched_off_where_the_docs_say(
 
 
 def test_no_more_scores_are_kept_than_answers_have_words(backbone: HFBackbone) -> None:
-    """Each is as long as the vocabulary, and a batch of images of several sizes has many rows."""
+    """Each is as long as the vocabulary, and a batch with images of several sizes has many rows."""
     said = backbone._prompter.answer_ids(SAID)
     head, seen = backbone.get_submodule(backbone._head), list[torch.Size]()
     handle = head.register_forward_hook(lambda _, __, out: seen.append(out.shape[:-1]))
@@ -230,7 +230,7 @@ def test_no_more_scores_are_kept_than_answers_have_words(backbone: HFBackbone) -
 
 @pytest.fixture(scope="module")
 def said_plainly(hf_backbone: Loaded) -> Callable[[str], list[str]]:
-    """What a family's untouched model answers; asked once."""
+    """The answers of a family's unmodified model; computed once."""
     return cache(lambda family: hf_backbone(family).answer(images(4), TEXTS))
 
 
@@ -251,7 +251,7 @@ def test_a_models_own_ways_to_generate_change_no_answer(
     backbone: HFBackbone,
     said_plainly: Callable[[str], list[str]],
 ) -> None:
-    """An answer is the likeliest, or what is scored would be another than what is said."""
+    """An answer is the likeliest one; otherwise the scored and the generated one would differ."""
     plain = said_plainly(family)
     config = backbone.vlm.generation_config
     before = {name: getattr(config, name) for name in own}
@@ -265,7 +265,7 @@ def test_a_models_own_ways_to_generate_change_no_answer(
 
 
 def test_what_is_read_on_vqa_scores_every_word_of_every_answer(backbone: HFBackbone) -> None:
-    """The same scores as a batch with padding has, whatever the order."""
+    """They are the same scores as those of a padded batch, in any order."""
     frames, image_of = images(2), torch.tensor([0, 1, 1, 0])
     said = backbone._prompter.answer_ids(SAID)
     with torch.no_grad():
@@ -287,7 +287,7 @@ def test_what_is_read_on_vqa_scores_every_word_of_every_answer(backbone: HFBackb
 def test_prompt_and_answer_are_what_the_template_makes_of_a_conversation(
     name: str, hf_backbone: Loaded
 ) -> None:
-    """An answer is scored in the tokens that training on conversations would have given it."""
+    """An answer is scored in the tokens with which training on conversations would have seen it."""
     prompter = hf_backbone(name)._prompter
     asked, answered = ({"type": "text", "text": text} for text in (TEXTS[0], "red cube"))
     said = [
@@ -349,7 +349,7 @@ def test_groups_are_named_after_what_they_are(backbone: HFBackbone) -> None:
 
 
 def seen_by(cameras: int) -> Any:
-    """Four frames, of several cameras in sizes of their own."""
+    """Four frames of several cameras, each with its own size."""
     views = [images(4, seed)[:, :height] for seed, height in zip(range(cameras), (64, 48, 32))]
     return views[0] if cameras == 1 else list(zip(*views, strict=True))
 
@@ -386,11 +386,11 @@ def test_hidden_states_keys_and_values_are_the_models_own(
 
 
 def test_every_camera_counts_in_its_place(backbone: HFBackbone) -> None:
-    """With pictures swapped or changed, the prompt's last token says something else.
+    """If pictures are swapped or changed, the prompt's last token changes too.
 
     A third picture adds its tokens.
 
-    (One picture may have more than two: LLaVA-OneVision looks closer at it.)
+    (One picture may have more than two views: LLaVA-OneVision looks closer at it.)
     """
     frames, more = seen_by(2), seen_by(3)
     turned, other = [row[::-1] for row in frames], [(x, 255 - y) for x, y in frames]
@@ -406,7 +406,7 @@ def test_every_camera_counts_in_its_place(backbone: HFBackbone) -> None:
 
 
 def test_nothing_is_left_behind(backbone: HFBackbone) -> None:
-    """None of our hooks stays.
+    """None of our hooks remains.
 
     transformers keeps one of its own on a vision tower whose layers it lists.
     """
@@ -416,22 +416,22 @@ def test_nothing_is_left_behind(backbone: HFBackbone) -> None:
 
 
 def test_no_two_calls_share_a_processor(backbone: HFBackbone) -> None:
-    """A tokenizer that two threads call at once may raise "Already borrowed"."""
+    """If two threads call a tokenizer at once, it may raise "Already borrowed"."""
     processors = Processors(backbone._prompter._processors.original)
     with processors.one() as first, processors.one() as second:
         called = {id(processors.original), id(first), id(second)}
         called |= {id(each.tokenizer) for each in (processors.original, first, second)}
         assert len(called) == 6
-    with copy.deepcopy(processors).one() as again:  # of a copy of the model
+    with copy.deepcopy(processors).one() as again:  # from a copy of the model
         assert again in (first, second)
 
 
 def test_several_threads_make_the_same_of_images_and_texts(backbone: HFBackbone) -> None:
-    """Each thread calls a copy of the processor, which has to do as the original does."""
+    """Each thread calls a copy of the processor, which has to act like the original."""
     seen = images(4)
 
     def make(turn: int) -> Any:
-        rows = [(i + turn) % 4 for i in range(4 - turn % 2)]  # of other lengths, so other padding
+        rows = [(i + turn) % 4 for i in range(4 - turn % 2)]  # other lengths, so other padding
         return backbone.process(seen[rows], [TEXTS[i] for i in rows])
 
     wanted = [make(turn) for turn in range(4)]
@@ -447,7 +447,7 @@ def test_several_threads_make_the_same_of_images_and_texts(backbone: HFBackbone)
 def test_what_threads_prepare_is_answered_and_read_alike(
     backbone: HFBackbone, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """For a GPU batches are prepared ahead, and here the CPU is said to be one."""
+    """For a GPU, batches are prepared ahead; here the CPU is treated as one."""
     shown, image_of = images(3), torch.tensor([0, 1, 1, 2])
     batches = [(shown[[i, 2]], [TEXTS[i], TEXTS[2]], [SAID[i], SAID[1]]) for i in (0, 1, 2, 1)]
     told = []
@@ -473,7 +473,7 @@ def test_image_tokens_are_the_processors(backbone: HFBackbone) -> None:
 
 
 def test_a_suffix_takes_the_place_of_a_generated_answer(backbone: HFBackbone) -> None:
-    """The expert's rotation of the keys is that of the words of an answer in the model."""
+    """The expert rotates the keys as the model does for the words of an answer."""
     said = backbone._prompter.answer_ids(["red cube two", "x3 y5", "yes no", "left right"])
     prompts = backbone.prepare(images(4), TEXTS)
     attention, norm = backbone._layers[0].self_attn, backbone._layers[0].input_layernorm
@@ -498,7 +498,7 @@ def test_a_suffix_takes_the_place_of_a_generated_answer(backbone: HFBackbone) ->
 
 @pytest.mark.parametrize("name", ["paligemma", "gemma3"])
 def test_a_suffix_sees_as_far_back_as_the_layers_windows(name: str, hf_backbone: Loaded) -> None:
-    """By the model itself: what a generated word's output depends on, layer by layer."""
+    """According to the model: what a generated word's output depends on, layer by layer."""
     backbone = hf_backbone(name)
     encoding = encode(backbone, images(4), TEXTS)
     visible = backbone.suffix(encoding, 3).visible
@@ -520,7 +520,7 @@ def test_a_suffix_sees_as_far_back_as_the_layers_windows(name: str, hf_backbone:
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 def test_products_in_bf16_leave_each_token_nearly_where_it_was(backbone: HFBackbone) -> None:
-    """Where an image's features meet words they have two types, which autocast has made."""
+    """Autocast alone would give an image's features and the words two dtypes."""
     batch, types = backbone.prepare(images(2), TEXTS[:2]), list[torch.dtype]()
     if backbone._family.connector is not None:
         connector = backbone.vlm.get_submodule(backbone._family.connector)

@@ -33,7 +33,7 @@ MEASURE = ("anchor", "--samples", "7", "--out", "a.safetensors", "--backbone")
 
 @pytest.fixture
 def model(hf_folder: Callable[[str], Path], place: Path) -> Path:
-    """A copy of a PaliGemma 2 to break."""
+    """A copy of a PaliGemma 2 that tests damage."""
     return Path(shutil.copytree(hf_folder("paligemma"), place / "model"))
 
 
@@ -55,7 +55,7 @@ def test_a_hub_id_without_network(bad: Bad) -> None:
 
 
 def test_a_path_that_is_no_text_is_named_as_the_reason(model: Path, bad: Bad) -> None:
-    """Transformers finds no model there."""
+    """transformers finds no model there."""
     moved = model.rename(model.with_name(os.fsdecode(b"caf\xe9")))
     bad(*MEASURE, moved, says=("caf\\udce9", "not UTF-8", "rename"))
 
@@ -63,7 +63,7 @@ def test_a_path_that_is_no_text_is_named_as_the_reason(model: Path, bad: Bad) ->
 def test_weights_that_a_repository_has_twice_are_fetched_once(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """As Mistral's have them, for transformers and for its own programs."""
+    """As in Mistral's repositories, which have them for transformers and for Mistral's programs."""
     there = ["config.json", "model-00001-of-2.safetensors", "consolidated.safetensors", "a.bin"]
 
     def download(
@@ -123,7 +123,7 @@ def test_a_folder_without_a_model_says_so(bad: Bad) -> None:
 def test_a_repository_that_is_no_model(
     bad: Bad, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What the hub gives may be a data set, or another library's weights."""
+    """The hub's repository may be a data set, or hold another library's weights."""
     monkeypatch.setattr(backbones.model_folder, "fetch", lambda name: tmp_path)
     bad(*MEASURE, "someone/a-data-set", says=("no config.json", "Hugging Face model"))
 
@@ -131,7 +131,7 @@ def test_a_repository_that_is_no_model(
 def test_a_model_without_a_head_that_scores_words(
     model: Path, bad: Bad, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Some classes of models to be fine-tuned answer with other things than words."""
+    """Some model classes for fine-tuning have outputs other than words."""
     kind = transformers.PaliGemmaForConditionalGeneration
     monkeypatch.setattr(kind, "get_output_embeddings", lambda self: None)
     bad(*MEASURE, model, says=("PaliGemmaForConditionalGeneration without a head", "family"))
@@ -170,7 +170,7 @@ def test_a_model_of_text_alone(bad: Bad, place: Path) -> None:
 
 
 def unknown(folder: Path) -> Path:
-    """A SmolVLM whose family's row somebody has taken out: see `without_smolvlm`."""
+    """A SmolVLM whose row of families has been removed: see `without_smolvlm`."""
     return write("smolvlm", folder)
 
 
@@ -216,7 +216,7 @@ def test_an_exported_model_remembers_where_its_layers_are(tmp_path: Path) -> Non
 
 
 def interleaved(x: torch.Tensor) -> torch.Tensor:
-    """Channel i is rotated with its neighbour, as GPT-J and Cohere do it."""
+    """Channel i is rotated together with its neighbour, as in GPT-J and Cohere."""
     return torch.stack([-x[..., 1::2], x[..., ::2]], dim=-1).flatten(-2)
 
 
@@ -237,7 +237,7 @@ def test_keys_that_are_rotated_otherwise_than_the_experts(
     place: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The expert's would silently stand elsewhere."""
+    """The expert's rotations would silently differ."""
     folder = shutil.copytree(hf_folder("smolvlm"), place / "other")
     backbones.load(str(folder))
     monkeypatch.setattr(transformers.models.llama.modeling_llama, function, other)
@@ -263,7 +263,7 @@ def test_keys_that_are_rotated_otherwise_than_the_experts(
 def test_a_family_that_cannot_be_used_is_refused_with_the_reason(
     kind: str, why: str, bad: Bad, place: Path
 ) -> None:
-    """Naming its layers would not help, so nothing says to do it."""
+    """Naming its layers would not help, so the error does not suggest it."""
     (place / "other").mkdir()
     (place / "other" / "config.json").write_text(json.dumps({"model_type": kind}))
     for name in ("other", "other#model.language_model.layers"):
@@ -285,11 +285,11 @@ def test_a_model_without_an_end_of_answers_is_refused(
 
 
 class SelfAttention(torch.nn.Module):
-    """Named as attention modules are."""
+    """Named like an attention module."""
 
 
 class CrossAttention(torch.nn.Module):
-    """Over the image, by its name."""
+    """Attention over the image, according to its name."""
 
 
 @pytest.mark.parametrize(
@@ -303,7 +303,7 @@ class CrossAttention(torch.nn.Module):
 def test_a_layer_without_one_attention_over_the_text(
     parts: tuple[torch.nn.Module, ...], says: str
 ) -> None:
-    """In a family that is not known: a hybrid one."""
+    """The family is unknown, for example a hybrid one."""
     layers = [torch.nn.Sequential(SelfAttention()), torch.nn.Sequential(*parts)]
     check = backbones.model_folder.check_attention
     with pytest.raises(AegisError, match="layer 1, a Sequential") as caught:
@@ -382,7 +382,7 @@ def test_a_file_that_is_missing_or_cut(
 def test_a_part_of_the_processor_that_is_missing_is_named(
     name: str, said: str, bad: Bad, model: Path
 ) -> None:
-    """Of no tokenizer transformers makes one without words, and images have no token then."""
+    """Without a tokenizer, transformers makes one without words, and images have no token."""
     (model / name).unlink()
     bad(*MEASURE, "model", says=(said, "the model that this one was made from"))
 
@@ -391,7 +391,7 @@ def test_a_part_of_the_processor_that_is_missing_is_named(
 def test_an_adapter_of_peft_is_refused_with_what_makes_a_model_of_it(
     alone: bool, bad: Bad, model: Path
 ) -> None:
-    """transformers would put it into the model, whose checkpoints then could not be written."""
+    """transformers would load it into the model, whose checkpoints could then not be written."""
     (model / "adapter_config.json").write_text('{"peft_type": "LORA"}')
     if alone:
         (model / "config.json").unlink()
@@ -404,7 +404,7 @@ def test_an_adapter_of_peft_is_refused_with_what_makes_a_model_of_it(
 def test_quantised_weights_are_refused_with_what_makes_a_model_of_them(
     part: str | None, bad: Bad, model: Path
 ) -> None:
-    """Nothing learns in them; an anchor of them would have been measured before that is said."""
+    """They cannot be trained, and the error comes before an anchor of them is measured."""
     config = json.loads((model / "config.json").read_text())
     within = config if part is None else config[part]
     within["quantization_config"] = {"quant_method": "bitsandbytes", "load_in_4bit": True}
@@ -529,13 +529,13 @@ def test_a_processors_file_that_holds_something_else(name: str, bad: Bad, model:
 
 
 def test_a_vocabulary_that_is_larger_than_the_models(bad: Bad, model: Path, place: Path) -> None:
-    """Its last words would be looked up past the table's end."""
+    """Its last words would be looked up beyond the table's end."""
     _, processor = MADE["paligemma"]()
     rows = len(processor.tokenizer)
     processor.tokenizer.add_tokens(["many", "cyan"])
     processor.tokenizer.save_pretrained(model)
     for asked, said in (("how many", "red"), ("what color is it", "cyan")):
-        for i in range(12):  # of which probes get about half
+        for i in range(12):  # about half of them are for probes
             Image.new("RGB", (8, 8)).save(place / f"{i}.png")
         lines = [{"image": f"{i}.png", "question": asked, "answers": [said]} for i in range(12)]
         (place / "asked.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
@@ -563,7 +563,7 @@ def test_the_processor_of_more_image_tokens(bad: Bad, model: Path) -> None:
 
 
 def test_an_anchor_of_another_size(bad: Bad, model: Path) -> None:
-    """That in the folder is of the embedded VLM: two layers, where this model has three."""
+    """The folder's anchor is of the embedded VLM: two layers, where this model has three."""
     bad(
         *TRAIN,
         "--set",
@@ -577,7 +577,7 @@ def test_an_anchor_of_another_size(bad: Bad, model: Path) -> None:
 def test_what_cannot_be_measured_is_named(
     bad: Bad, place: Path, aegis: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A projector that keeps a matrix of its own."""
+    """A projector with a matrix of its own."""
     from transformers.models.llava_onevision import modeling_llava_onevision as llava
 
     class Mixing(llava.LlavaOnevisionMultiModalProjector):
@@ -599,7 +599,7 @@ def test_what_cannot_be_measured_is_named(
 
 
 def test_a_question_with_the_models_own_marker(hf_folder: Callable[[str], Path]) -> None:
-    """Before anything is asked: `--skip-bad` can leave it out."""
+    """It is refused before anything is asked, so `--skip-bad` can leave it out."""
     for family in FAMILIES.keys() - WITH_TORCHVISION:
         backbone = backbones.load(str(hf_folder(family)))
         for marker in backbone._prompter._markers:
@@ -638,7 +638,7 @@ def test_a_text_that_is_too_long_is_told_before_anything_is_asked(
 
 
 def test_an_image_that_the_processor_refuses(hf_folder: Callable[[str], Path]) -> None:
-    """It is not said to be a text."""
+    """The error does not call it a text."""
     narrow = torch.zeros(1, 1000, 2, 3, dtype=torch.uint8)
     with pytest.raises(
         AegisError, match="^found: an image or a text .* refuses: .*: absolute aspect ratio"
@@ -657,7 +657,7 @@ def test_of_many_questions_the_one_is_named_that_the_processor_refuses(
     with pytest.raises(AegisError, match="'what is this' about 2 x 1000 pixels: absolute aspect"):
         backbone.prepare([wide, narrow, wide], asked)
     backbone.check_text("what is this", "red", wide)
-    backbone.check_text("what is this", "red")  # which knows of no image
+    backbone.check_text("what is this", "red")  # the check sees no image
     with pytest.raises(AegisError, match="absolute aspect"):
         backbone.check_text("what is this", "red", narrow)
 

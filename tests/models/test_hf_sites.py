@@ -1,4 +1,4 @@
-"""What the maps of Hugging Face models read on questions, by how changes change outputs."""
+"""What maps of Hugging Face models read for questions, tested by the effect of changes."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ Loaded = Callable[[str], HFBackbone]  # by a family's name
 SAID = ["red", "two", "x3 y5", ""]
 TOWER = "vision_tower"
 DEEPER = f"{TOWER}.vision_model"  # where transformers 5.5 has what later releases have in the tower
-# What a family keeps outside any map, norm or table of torch's: held still as a whole.
+# What a family keeps outside any torch map, norm or table: frozen as a whole.
 LONE = {
     "llava_onevision": ["image_newline"],
     "llava": [f"{TOWER}.embeddings.class_embedding"],
@@ -72,9 +72,9 @@ def test_the_measured_inputs_say_what_any_change_of_a_map_does(
 
 
 def _watch_changes(backbone: HFBackbone, modules: dict[str, nn.Module]) -> dict[str, list[Tensor]]:
-    """The energy of the change of each site's outputs, and the same by the measured moments.
+    """The energy of the change of each site's outputs, and the same from the measured moments.
 
-    It is filled as the model runs.
+    It is filled while the model runs.
     """
     generator = torch.Generator().manual_seed(0)
     changes: dict[str, list[Tensor]] = {}
@@ -95,7 +95,7 @@ def _watch_changes(backbone: HFBackbone, modules: dict[str, nn.Module]) -> dict[
                 moment = second_moment(inputs.dense_rows(module, arguments[0]))
             else:
                 moment, _ = inputs.moment(module, arguments[0])
-            # the shadow has no hooks of its own: it was copied before they were set
+            # the shadow has no hooks: it was copied before they were set
             energy = (other(arguments[0]) - output).double().square().sum() / scale**2
             was = changes.get(site, [torch.zeros((), dtype=torch.float64)] * 2)
             changes[site] = [was[0] + energy, was[1] + _quadratic(moment, drawn)]
@@ -112,7 +112,7 @@ def _quadratic(moment: Tensor, drawn: dict[str, Tensor]) -> Tensor:
     weight, bias = drawn["weight"], drawn.get("bias")
     if moment.ndim == 1:  # rows of a table
         return (moment * weight.square().sum(1)).sum()
-    if moment.ndim == 3:  # a scale (and shift) a channel
+    if moment.ndim == 3:  # a scale (and shift) per channel
         both = torch.stack([weight, bias], -1) if bias is not None else weight[:, None]
         return torch.einsum("di,dij,dj->", both, moment, both)
     flat = weight.flatten(1) if bias is None else torch.cat([weight.flatten(1), bias[:, None]], 1)
@@ -121,7 +121,7 @@ def _quadratic(moment: Tensor, drawn: dict[str, Tensor]) -> Tensor:
 
 @pytest.mark.parametrize("name", ["llava", "llava_next"])
 def test_no_gradient_comes_to_what_takes_no_part(name: str, hf_backbone: Loaded) -> None:
-    """CLIP's layers behind the one that is read, which are called all the same."""
+    """CLIP's layers after the one that is read are called nevertheless."""
     backbone = hf_backbone(name)
     for scored in backbone.read_vqa(images(2), torch.tensor([0, 0, 1, 1]), TEXTS, SAID):
         scored.scores.square().sum().backward()
@@ -137,9 +137,9 @@ def test_no_gradient_comes_to_what_takes_no_part(name: str, hf_backbone: Loaded)
 def test_answers_keep_their_scores_under_any_protected_update(
     name: str, hf_backbone: Loaded
 ) -> None:
-    """At the anchor's own inputs nothing changes, although every parameter is pushed at random.
+    """With the anchor's own inputs nothing changes, although every parameter is moved at random.
 
-    What is left unprotected changes the outputs.
+    Sites that are left unprotected change the outputs.
     """
     backbone = hf_backbone(name).double()
     sites, said = backbone.sites(), scores(backbone)
@@ -157,12 +157,12 @@ def test_answers_keep_their_scores_under_any_protected_update(
 
 @pytest.mark.parametrize("name", FAMILIES)
 def test_kfac_draws_back_what_answers_mind(name: str, hf_backbone: Loaded) -> None:
-    """A strong step undoes most of what a push did to the answers, and leaves much of the push."""
+    """A strong step undoes most of the effect on the answers, and leaves much of the movement."""
     backbone = hf_backbone(name).double()
     said, one = scores(backbone), asked()
     asking = VQASet(
         one.images, np.zeros(64, int), one.questions * 64
-    )  # as many draws of the words that it may say
+    )  # as many draws of the possible words
     measured = Anchor(curvature=curvature.measure(backbone, asking, 1.0, seed=0))
     dense = {site for site, module in backbone.site_modules().items() if isinstance(module, DENSE)}
     assert measured.curvature.keys() == {
@@ -179,14 +179,14 @@ def test_kfac_draws_back_what_answers_mind(name: str, hf_backbone: Loaded) -> No
 
 
 def divergence(before: Tensor, after: Tensor) -> float:
-    """Mean KL divergence of the words' distributions, in nats."""
+    """Mean KL divergence between the word distributions, in nats."""
     p, q = before.log_softmax(-1), after.log_softmax(-1)
     return (p.exp() * (p - q)).sum(-1).mean().item()
 
 
 @torch.no_grad()
 def moved(backbone: HFBackbone, weight: float, measured: Anchor) -> HFBackbone:
-    """A copy with every map somewhere else, as far as kfac leaves it there."""
+    """A copy with every map moved, as far as kfac allows it."""
     other, generator = copy.deepcopy(backbone), torch.Generator().manual_seed(1)
     METHODS["kfac"].adapt(other, {}, {})
     options = asdict(Kfac(weight=weight, damping=0.0, balance=0.0, every=1))
@@ -205,7 +205,7 @@ def moved(backbone: HFBackbone, weight: float, measured: Anchor) -> HFBackbone:
 
 @torch.no_grad()
 def pushed(backbone: HFBackbone, sites: dict[str, str], measured: Anchor) -> HFBackbone:
-    """A copy with every parameter moved, as far as the null-space method lets these sites go."""
+    """A copy with every parameter moved, as far as the null-space method allows for these sites."""
     other, generator = copy.deepcopy(backbone), torch.Generator().manual_seed(1)
     options = {"energy": 1.0, "soft": 0.0, "every": 1, "protect": SITE_KINDS, "keeps": "weights"}
     constrain = (
@@ -221,7 +221,7 @@ def pushed(backbone: HFBackbone, sites: dict[str, str], measured: Anchor) -> HFB
 
 
 def asked() -> VQASet:
-    """One question, so that there are directions which none reads."""
+    """A single question, so some directions are read by none."""
     return VQASet(images(1).numpy(), np.zeros(1, int), (Question("count", TEXTS[0], "two"),))
 
 

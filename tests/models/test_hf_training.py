@@ -56,9 +56,9 @@ def gradients(
     seed: int = 0,
     far: float = 1.0,
 ) -> step.StepGradients:
-    """One step's, of the dual backward where the method has one.
+    """One step's gradients, from the dual backward if the method has one.
 
-    The seed draws anchor and noise, and `far` scales the anchor's means.
+    The seed determines anchor and noise, and `far` scales the anchor's means.
     """
     backbone = policy.backbone
     image, text = (
@@ -96,9 +96,9 @@ def gradients(
     )
 
 
-# These differ in what their layers are given: masks, windows and rotations.
+# These differ in the inputs of their layers: masks, windows and rotations.
 COMPILED = ("paligemma", "smolvlm", "qwen2_5_vl", "gemma3")
-# While it traces a graph, torch.compile looks at a field that PyTorch warns of.
+# While tracing a graph, torch.compile accesses a field for which PyTorch warns.
 tracing = pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf")
 
 # --- gradients ------------------------------------------------------------------------------------
@@ -108,7 +108,7 @@ tracing = pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor tha
 def test_checkpointing_gives_the_same_gradients_of_both_backwards(
     family: str, hf_backbone: Loaded
 ) -> None:
-    """And computes each layer again in each of them, or it would be checkpointing nothing."""
+    """And each layer is computed again in each of them; otherwise nothing would be checkpointed."""
     found, runs = [], []
     for again in (False, True):
         policy = policy_over(hf_backbone(family))
@@ -164,7 +164,7 @@ def test_an_expert_that_recomputes_keeps_less_and_gives_the_same_gradients(
 def test_compiled_layers_give_the_same_gradients_of_both_backwards(
     family: str, hf_backbone: Loaded
 ) -> None:
-    """And none to what has none. A backend without code generation keeps this test quick."""
+    """And none where there was none. A backend without code generation keeps this test quick."""
     found = []
     for compiled in (False, True):
         policy = policy_over(hf_backbone(family))
@@ -202,7 +202,7 @@ def test_all_layers_and_lengths_share_what_is_compiled_once(hf_backbone: Loaded)
             torch.testing.assert_close(one[:, :length], other, rtol=1e-4, atol=1e-5)
         for one, other in zip(passed.keys_values, wanted.keys_values, strict=True):
             torch.testing.assert_close(one.key[:, :, :length], other.key, rtol=1e-4, atol=1e-5)
-    assert len(made) == 2  # one of the language layers, one of the vision tower's
+    assert len(made) == 2  # one for the language layers, one for the vision tower's
 
 
 @pytest.mark.parametrize("family", COMPILED[:2])
@@ -220,7 +220,7 @@ def test_compiled_layers_find_the_same_answers(family: str, hf_backbone: Loaded)
 def test_a_run_with_compiled_layers_trains_alike(
     hf_folder: Made, demos_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Validation is of one batch, as large as the others: another size would be compiled anew."""
+    """Validation has one batch, of the usual size: another size would be compiled again."""
     monkeypatch.setattr(train, "VALIDATION_FRAMES", 4)
     for owner, name in ((HFBackbone, "compile_passes"), (ActionExpert, "compile_layers")):
         quick = functools.partialmethod(getattr(owner, name), "aot_eager")
@@ -241,7 +241,7 @@ def test_a_run_with_compiled_layers_trains_alike(
 def test_attention_has_no_dense_mask_where_it_needs_none(
     hf_backbone: Loaded, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """On a GPU, PyTorch takes flash kernels for such calls."""
+    """On a GPU, PyTorch uses flash kernels for such calls."""
     attend, dense = torch.nn.functional.scaled_dot_product_attention, []
 
     def noting(*args: Any, **named: Any) -> torch.Tensor:
@@ -298,9 +298,9 @@ def test_the_projected_gradient_of_each_group_is_orthogonal_to_the_anchors(
 
 @pytest.mark.parametrize("precision", ["float32", "bf16"])
 def test_bf16_weights_are_measured_in_wider_numbers(precision: str, hf_backbone: Loaded) -> None:
-    """The ledger's row with bf16 weights is near that with the same weights in float32.
+    """The ledger's row with bf16 weights is close to that with the same weights in float32.
 
-    Products in bf16 would be off by more.
+    Products in bf16 would give a larger error.
     """
     rows = []
     for half in (True, False):
@@ -327,9 +327,9 @@ def test_bf16_weights_are_measured_in_wider_numbers(precision: str, hf_backbone:
 
 
 def test_the_anchor_of_bf16_weights_is_not_rounded(hf_backbone: Loaded) -> None:
-    """A pass is at no distance from its own moments.
+    """A pass has no distance from its own moments.
 
-    Rounded to eight bits they would be off by a thousandth of the mean.
+    If rounded to eight bits, they would be off by a thousandth of the mean.
     """
     backbone = hf_backbone("smolvlm")
     backbone.round_weights(torch.bfloat16)
@@ -372,7 +372,7 @@ def test_every_method_moves_or_keeps_what_it_should(hf_backbone: Loaded) -> None
 def run(
     tmp_path_factory: pytest.TempPathFactory, hf_folder: Made, hf_anchor: Made, demos_file: Path
 ) -> Path:
-    """A finished run of `aegis` on PaliGemma 2, with checkpointing; read only."""
+    """A finished run of `aegis` on PaliGemma 2, with checkpointing; read-only."""
     out = tmp_path_factory.mktemp("runs") / "run"
     settings = small(hf_folder("paligemma"), gradient_checkpointing=True)
     train.run(settings, "aegis", demos_file, hf_anchor("paligemma"), out)
@@ -439,7 +439,7 @@ def test_the_card_says_what_was_done(run: Path, hf_folder: Made) -> None:
     card = (checkpoint.last(run) / "backbone" / "README.md").read_text()
     ledger = artifacts.load(run / "ledger.safetensors").tensors
     inputs = artifacts.read_header(run / "ledger.safetensors").inputs
-    assert f"`{hf_folder('paligemma').name}`" in card  # and not where it lies
+    assert f"`{hf_folder('paligemma').name}`" in card  # and not its path
     assert "4 of 4 steps" in card and "`aegis`" in card
     assert all(digest in card for digest in inputs.values()) and set(inputs) == {
         "anchor",
@@ -477,7 +477,7 @@ def test_a_resumed_run_ends_in_the_same_bytes(
 def test_methods_export_a_plain_folder(
     method: str, family: str, hf_folder: Made, hf_anchor: Made, demos_file: Path, tmp_path: Path
 ) -> None:
-    """nullspace with a share of 1 leaves nothing along what VQA reads.
+    """nullspace with a share of 1 leaves no movement along what VQA reads.
 
     Norms, patches, a tied head and a lone row are among the sites.
     """
@@ -555,7 +555,7 @@ def test_a_full_disk_is_one_error(hf_folder: Made, demos_file: Path, tmp_path: P
 def test_a_checkpoint_is_on_the_disk_before_it_has_its_name(
     hf_folder: Made, demos_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """transformers leaves the weights that it writes in memory, which a power cut takes."""
+    """transformers leaves the weights that it writes in the page cache, which a power cut loses."""
     synced, rename, found = set[int](), os.rename, list[str]()
     monkeypatch.setattr(os, "fsync", lambda number: synced.add(os.fstat(number).st_ino))
 

@@ -34,7 +34,7 @@ def test_normalized_rows_have_mean_zero_and_deviation_one() -> None:
 
 
 def test_a_large_mean_costs_no_digits() -> None:
-    """E[x^2] - E[x]^2 in float32 returns anything from 0 to 0.66 here."""
+    """In float32, E[x^2] - E[x]^2 gives anything from 0 to 0.66 here."""
     rows = 1000 + 0.25 * torch.randn(2000, 1, generator=generator())
     expected = rows.double().std(0, correction=0).float()
     torch.testing.assert_close(Normalizer.fit(rows).std, expected, rtol=1e-6, atol=0)
@@ -49,10 +49,10 @@ def test_a_dimension_that_never_varied_is_only_centred_and_keeps_its_value(
     still = level + (1e-6 * abs(level) if level else 1e-7) * noise
     rows = torch.cat([still, noise], dim=1)
     scale = fit(rows)
-    # Whatever is predicted of it, a robot is told the value that it always had.
+    # Whatever is predicted for it, the robot receives the value that it always had.
     predicted = scale.invert(torch.randn(50, 2, generator=generator(1)))
     assert (predicted[:, 0] == scale.mean[0]).all() and predicted[:, 1].std() > 0.1
-    # sensor noise a thousand times larger than any seen still is a small input
+    # sensor noise a thousand times larger than any seen before is still a small input
     assert scale(rows + 1e-3)[:, 0].abs().max() < 0.01
 
 
@@ -61,7 +61,7 @@ def test_a_dimension_that_never_varied_is_only_centred_and_keeps_its_value(
 def test_small_units_are_scaled_as_large_ones(
     fit: Callable[[Tensor], Normalizer], unit: float
 ) -> None:
-    """As of motions in metres a frame, which are a hundredth of a millimetre."""
+    """For example motions in metres per frame, which are a hundredth of a millimetre."""
     rows = torch.randn(300, 2, generator=generator()) + torch.tensor([0.0, 2.0])
     one, other = fit(rows), fit(rows * unit)
     torch.testing.assert_close(other(rows * unit), one(rows), rtol=1e-4, atol=1e-4)
@@ -88,7 +88,7 @@ def test_invert_undoes_forward() -> None:
 
 
 def velocity(policy: Policy, samples: slice) -> Tensor:
-    """[B, K, H, A] of fixed noise at fixed times, for some of K = 3 flow samples."""
+    """[B, K, H, A] for fixed noise at fixed times, for some of K = 3 flow samples."""
     batch = robot_batch()
     encoding = policy.encode(batch.images, batch.instructions)
     noisy = torch.randn(5, 3, CHUNK, 2, generator=generator(1))
@@ -194,7 +194,7 @@ def test_acting_is_a_function_of_its_generator() -> None:
 
 
 def test_a_frame_is_acted_on_alike_alone_and_in_company() -> None:
-    """Texts of other lengths in the batch only add padding, which the expert must not read."""
+    """Longer texts in the batch only add padding, which the expert must not read."""
     policy, batch = make_policy(), robot_batch()
     with torch.no_grad():
         encodings = [policy.encode(batch.images[:n], batch.instructions[:n]) for n in (2, 3)]

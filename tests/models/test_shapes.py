@@ -1,4 +1,4 @@
-"""Models of true shape with random weights, made of tables in the code."""
+"""Models with real shapes and random weights, built from tables in the code."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from aegis_cli.models.backbones import of_shape, shapes
 @pytest.mark.parametrize("name", shapes.SHAPES)
 def test_a_shape_has_the_parameters_that_its_name_says(name: str) -> None:
     shape = shapes.SHAPES[name]
-    with torch.device("meta"):  # nothing takes memory
+    with torch.device("meta"):  # takes no memory
         model = of_shape.assemble(shape)
     assert sum(p.numel() for p in model.parameters()) // 10**6 == shape.parameters
 

@@ -1,4 +1,4 @@
-"""The dual encoder in the package: small, made by its recipe, and as good as it says."""
+"""The dual encoder in the package: small, made by its recipe, and as good as it claims."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_zero_shot_is_well_above_chance_and_leaves_something_to_learn(name: str)
 def test_it_names_validation_pictures_as_well_as_it_says(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Within three standard errors; only the first pictures of that part are made."""
+    """Within three standard errors; only the first pictures of that part are rendered."""
     model, provenance = load_file(PATH)
     if name != "digits":
         monkeypatch.setattr(embedded, "COUNTS", {"train": 8, "validation": 100, "test": 8})

@@ -1,4 +1,4 @@
-"""The VLMs in the package: small enough, made by their recipes, and as good as they say."""
+"""The VLMs in the package: small enough, made by their recipes, and as good as they claim."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ RECIPES = Path(__file__).parent.parent.parent / "recipes"
 NAMES = ("embedded", "embedded-easy")
 SHA256 = "e576cf9fdf9f053d37736ef1946cf5a1bf247519f923b09e9becc104a0316a56"
 FINGERPRINT = "efaf5fc3906ddcfc9ff03180743e496c479e618fcf5aa9ba3a8483afd13af818"
-# Accuracies that a family of each set has at least, whatever the thirty or so questions asked here.
+# The accuracy that every family of each set reaches, whichever thirty or so questions are asked.
 LEAST = 0.75
 
 

@@ -1,4 +1,4 @@
-"""Pre-training: resumable to the same bytes, honest, and careful with what is there."""
+"""Pre-training: resumes to the same bytes, is honest, and careful with existing files."""
 
 from __future__ import annotations
 
@@ -45,19 +45,19 @@ RECIPE = PretrainRecipe(
 )
 
 
-whole_easy_training = cache(vlm.easy_training)  # thousands of pictures are decoded
+whole_easy_training = cache(vlm.easy_training)  # decodes thousands of pictures
 
 
 @cache
 def few_easy_pictures() -> Rendered:
-    """More pictures of easy-VQA than the steps of a run here show."""
+    """More pictures of easy-VQA than a run's steps show here."""
     whole, few = whole_easy_training(), slice(60)
     return Rendered(whole.images[few], whole.cells[few], whole.questions[few])
 
 
 @pytest.fixture(autouse=True, scope="module")
 def little_to_read() -> Iterator[None]:
-    """A run asks few questions while it trains, and does not read all of easy-VQA anew."""
+    """A run asks few questions during training, and does not read all of easy-VQA again."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(vlm, "VALIDATION_QUESTIONS", 14)
         patch.setattr(vlm, "easy_training", few_easy_pictures)
@@ -134,7 +134,7 @@ def test_the_checkpoint_is_a_backbone_in_bfloat16(finished) -> None:
 
 
 def test_training_moves_the_loss(tmp_path: Path) -> None:
-    """Forty steps on the same few scenes: the answers' loss falls by a lot, not by chance."""
+    """Forty steps on the same few scenes: the answers' loss falls by more than chance explains."""
     events: list[Progress] = []
     recipe = replace(RECIPE, scenes=4, steps=40, lr=1e-2, checkpoint_every=40)
     vlm.run(recipe, tmp_path, on_event=events.append)
@@ -185,7 +185,7 @@ def test_a_loss_that_is_not_finite_stops_with_the_step(
         vlm.run(RECIPE, tmp_path)
     saved = artifacts.load(
         tmp_path / "state.safetensors", "training-state"
-    )  # of the last good checkpoint
+    )  # from the last good checkpoint
     assert saved.header.meta["step"] == 2 and not (tmp_path / "model.safetensors").exists()
 
 
@@ -268,7 +268,7 @@ def test_every_training_question_of_easy_vqa_is_in_one_row_with_its_picture() ->
 def test_cells_are_learned_from_scenes_alone() -> None:
     run = vlm._build(replace(EASY, scenes=8), ignore)
     gradients = []
-    for rows in (np.array([6, 7]), np.array([6, 7, 8, 9, 10])):  # the scenes stand first
+    for rows in (np.array([6, 7]), np.array([6, 7, 8, 9, 10])):  # the scenes come first
         run.cell_head.zero_grad()
         vlm._loss(run, rows, np.zeros(len(rows), bool)).backward()
         gradients.append(run.cell_head.weight.grad)

@@ -1,4 +1,4 @@
-"""Pre-training of the dual encoder: resumable to the same bytes, honest about what came out."""
+"""Pre-training of the dual encoder: resumes to the same bytes, and reports honest results."""
 
 from __future__ import annotations
 
@@ -125,18 +125,18 @@ def test_the_loss_is_least_where_positives_win_and_no_others_count_against_them(
     )
     torch.testing.assert_close(
         dual.contrastive(logits, unique), by_hand
-    )  # CLIP's own where each has one
+    )  # equal to CLIP's own if each has one
     if (true.sum(1) == true.sum(1)[0]).all() and (true.sum(0) == true.sum(0)[0]).all():
         torch.testing.assert_close(best, sum(entropy) / 2)
     doubled = torch.cat(
         [positive, positive], dim=1
-    )  # each caption twice: twice as many positives, none of them a negative
+    )  # each caption twice: twice as many positives, and none of them is a negative
     costs = [dual.contrastive(torch.where(p, 0.0, -1e4), p) for p in (positive, doubled)]
     assert float(costs[1] - costs[0]) == pytest.approx(np.log(2) / 2, rel=1e-4)
 
 
 def test_equal_captions_are_no_negatives_of_each_other(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whatever is drawn, the positives are all that is true, not what was drawn."""
+    """Whatever is drawn, the positives are all true captions, not only the drawn ones."""
     seen: list[torch.Tensor] = []
     monkeypatch.setattr(
         dual, "contrastive", lambda logits, positive: seen.append(positive) or logits.sum() * 0
@@ -145,7 +145,7 @@ def test_equal_captions_are_no_negatives_of_each_other(monkeypatch: pytest.Monke
     solid = np.flatnonzero(run.pictures.facts[:, 0] == list(corpus.KINDS).index("solids"))[0]
     dual._loss(
         run, np.full(16, solid), np.random.default_rng(0)
-    )  # one picture, of which three things can be said
+    )  # one picture, with three true captions
     assert seen[0].shape == (16, 3) and seen[0].all()
     dual._loss(run, np.arange(40), np.random.default_rng(0))
     assert seen[1].any(0).all() and seen[1].any(1).all() and not seen[1].all()

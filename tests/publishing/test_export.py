@@ -1,4 +1,4 @@
-"""A policy in LeRobot's layout is the run's policy, and all of it without LeRobot."""
+"""A policy in LeRobot's layout is the run's whole policy, and works without LeRobot."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def test_a_run_that_is_not_finished_is_exported_with_a_word_on_it(
     assert "2 of 3,000 steps" in card
     code, _, err = aegis("push", run, "me/reach", "--dry-run")
     assert code == 0 and "2 of 3,000 steps" in " ".join(err.split())
-    # A policy that has been taken out of its run has none.
+    # A policy taken out of its run has none.
     alone = export.run(tmp_path / "part", tmp_path / "alone")
     assert (alone.steps, alone.planned_steps) == (None, None)
 
@@ -148,7 +148,7 @@ def test_the_command_says_what_lerobot_will_see(
 def test_a_camera_that_a_dataset_names_otherwise_keeps_its_name(
     run_folder: Path, tmp_path: Path
 ) -> None:
-    """As `observation.image` of lerobot/pusht; the prefix is added to bare names alone."""
+    """For example `observation.image` of lerobot/pusht; the prefix is only added to bare names."""
     report = export.run(run_folder, tmp_path / "x", camera="observation.image")
     assert report.pictures == ("observation.image",)
     features = json_of(tmp_path / "x" / "config.json")["input_features"]
@@ -181,7 +181,7 @@ def test_the_card_names_a_picture_that_is_not_the_tasks_own(
 def test_a_checkpoints_layout_has_the_recipe_that_its_card_names(
     run_folder: Path, tmp_path: Path
 ) -> None:
-    """As a push has it, and under no name by which the folder would be taken for a run."""
+    """As in a push, under a name that does not make the folder look like a run."""
     export.run(run_folder, tmp_path / "x", form=card.AEGIS)
     assert f"`{export.RECIPE}`" in (tmp_path / "x" / "README.md").read_text()
     learned = recipes.load(run_folder / "recipe.yaml")

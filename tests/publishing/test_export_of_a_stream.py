@@ -35,7 +35,7 @@ FORMS = (card.LEROBOT, card.AEGIS)
 
 
 def chunk(policy: DeployedPolicy, task: str) -> np.ndarray:
-    """What a policy predicts at some observation of a task's robot."""
+    """A policy's predictions at some observation of a task's robot."""
     rng = np.random.default_rng(0)
     picture = rng.integers(0, 256, (16, 16, 3), dtype=np.uint8)
     positions = rng.normal(size=JOINTS[task]).astype(np.float32)
@@ -128,7 +128,7 @@ def test_merged_maps_compute_what_the_routed_ones_did() -> None:
     routing.activate(sites, 1)
     wanted = root["b"](root["a"](x))
     with pytest.raises(ValueError, match="over 2 experts"):
-        routing.merge(root, sites, 2)  # of which "a" has no router
+        routing.merge(root, sites, 2)  # "a" has no router for it
     assert root["a"] is sites["a"] and torch.equal(root["b"](root["a"](x)), wanted)
     routing.merge(root, sites, 1)
     assert type(root["a"]) is nn.Linear is type(root["b"])

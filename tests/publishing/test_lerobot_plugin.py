@@ -1,4 +1,4 @@
-"""The plugin's policy, tried with a stand-in of LeRobot."""
+"""The plugin's policy, tested with a stand-in for LeRobot."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class PolicyFeature:
 
 @dataclass
 class Registered:
-    """What LeRobot finds by a name, and what the plugin's optimizers begin with."""
+    """What LeRobot finds by a name, and the base of the plugin's optimizers."""
 
     @classmethod
     def register_subclass(cls, _: str) -> Callable[[type], type]:
@@ -54,7 +54,7 @@ class Registered:
 
 @dataclass
 class Preset:
-    """LeRobot's AdamW, of what the plugin sets."""
+    """The fields of LeRobot's AdamW that the plugin sets."""
 
     lr: float
     weight_decay: float
@@ -63,7 +63,7 @@ class Preset:
 
 @dataclass
 class PreTrainedConfig(Registered):
-    """The features of a policy, as LeRobot tells them apart."""
+    """The features of a policy, as LeRobot distinguishes them."""
 
     input_features: dict[str, PolicyFeature] = field(default_factory=dict)
     output_features: dict[str, PolicyFeature] = field(default_factory=dict)
@@ -114,7 +114,7 @@ STAND_IN: dict[str, dict[str, Any]] = {
 
 @pytest.fixture
 def plugin(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    """The plugin's module of policies, on the stand-in; both are gone afterwards."""
+    """The plugin's module of policies, on the stand-in; both are removed afterwards."""
     for name, content in STAND_IN.items():
         module = ModuleType(name)
         vars(module).update(content)
@@ -183,7 +183,7 @@ def test_other_pictures_are_refused_with_the_names_of_training(plugin: Any) -> N
 
 # --- scales ---------------------------------------------------------------------------------------
 
-STILL = {  # the third number never moved; LeRobot then says a deviation of 0, or of rounding
+STILL = {  # the third number never moved; LeRobot then states a deviation of 0, or a rounding error
     "action": {
         "mean": [0.5, -1.0, 0.25],
         "std": [0.2, 1e-4, 1e-9],
@@ -247,7 +247,7 @@ BAD_STATES = [
 def test_a_broken_sensor_is_refused_at_every_call(
     state: torch.Tensor, says: str, plugin: Any
 ) -> None:
-    """Also at one that goes on with a chunk: no action of an older prediction moves the robot."""
+    """Even when a chunk continues: no action of an older prediction moves the robot."""
     fresh, begun = acting(plugin), acting(plugin)
     begun.select_action(seen())
     for policy in (fresh, begun):
@@ -287,7 +287,7 @@ def test_a_batch_without_a_state_is_refused(plugin: Any) -> None:
 
 
 def test_another_task_drops_the_chunk_of_the_one_before(plugin: Any) -> None:
-    """As a deployed policy does; what is left of a chunk is not taken up again."""
+    """As in a deployed policy; the rest of a chunk is not resumed."""
     policy, other = acting(plugin), acting(plugin)
     chunks = [
         other.predict_action_chunk(seen(text, shade=shade))
@@ -303,7 +303,7 @@ def test_another_task_drops_the_chunk_of_the_one_before(plugin: Any) -> None:
 def test_lerobots_real_time_chunking_gets_the_chunks_of_load_policy(
     delay: int | None, filled: int, plugin: Any
 ) -> None:
-    """LeRobot fills up what is left of a chunk with zeros, and its delay may be longer."""
+    """LeRobot pads the rest of a chunk with zeros, and its delay may be longer."""
     own, policy = DeployedPolicy(make_policy().eval(), None, (), 2), acting(plugin)
     left = torch.linspace(-1, 1, 6).reshape(3, 2)
     given = torch.cat([left, torch.zeros(filled, 2)])
@@ -317,7 +317,7 @@ def test_lerobots_real_time_chunking_gets_the_chunks_of_load_policy(
 
 
 def test_more_than_a_chunk_can_continue_is_left_out(plugin: Any) -> None:
-    """Later versions of LeRobot fill up by the last action."""
+    """Later versions of LeRobot pad with the last action."""
     left = torch.linspace(-1, 1, 8).reshape(4, 2)
     longer = torch.cat([left, left[-1:].expand(6, 2)])
     given = {"inference_delay": 1, "prev_chunk_left_over": left}
@@ -351,7 +351,7 @@ def test_actions_that_are_not_finite_are_refused(plugin: Any) -> None:
 
 
 def test_an_ensemble_is_that_of_load_policy(plugin: Any, tmp_path: Path) -> None:
-    """Another text begins it anew, and a policy that is saved keeps it."""
+    """Another text restarts it, and a saved policy keeps it."""
     own = DeployedPolicy(make_policy().eval(), None, (), 2, ensemble=0.1)
     policy = acting(plugin)
     policy.config.n_action_steps, policy.config.temporal_ensemble_coeff = 1, 0.1
@@ -383,9 +383,9 @@ def test_lerobot_trains_by_the_settings_of_aegis_train(plugin: Any) -> None:
 
 @pytest.mark.parametrize("steps", [300, 40_000])
 def test_lerobots_learning_rates_are_those_of_aegis_train(steps: int, plugin: Any) -> None:
-    """The rise is as long in a short training as in a long one, and the end is its own.
+    """The warm-up is equally long in short and long trainings; the decay ends with the training.
 
-    A long one leaps from each step that is compared to the next: a rate follows from the step.
+    A long training is compared only at some steps, since a rate depends only on the step.
     """
     peaks = [1e-4, 1e-3]
     groups = [{"params": [nn.Parameter(torch.zeros(1))], "lr": peak} for peak in peaks]
@@ -428,7 +428,7 @@ def test_a_method_that_protects_asks_for_the_policys_anchor(method: str, plugin:
 
 
 def test_a_blank_task_is_warned_of_once(plugin: Any, caplog: pytest.LogCaptureFixture) -> None:
-    """LeRobot gives an empty text where `lerobot-rollout` has no --task."""
+    """LeRobot passes an empty text if `lerobot-rollout` has no --task."""
     policy = acting(plugin)
     for _ in range(5):
         policy.select_action(seen(""))
@@ -476,7 +476,7 @@ def test_a_picture_that_is_missing_is_named_beside_those_that_are_there(plugin: 
 def test_a_loaded_policy_says_what_lerobot_does_not_compare_with_a_robot(
     plugin: Any, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """And LeRobot itself knows what its actions are called."""
+    """And LeRobot itself knows the names of its actions."""
     names = ["pan.pos", "lift.pos"]
     model, meta = make_policy(), {**NAMED, "action_names": names, "fps": 15.0}
     made = config(plugin, model, IMAGE)
@@ -489,7 +489,7 @@ def test_a_loaded_policy_says_what_lerobot_does_not_compare_with_a_robot(
 
 
 def dataset(actions: list[str] | None, fps: int = 30, robot: str | None = None) -> Any:
-    """LeRobot's metadata of a dataset, as far as a policy is told of it."""
+    """LeRobot's metadata of a dataset, as far as a policy receives it."""
     state = {"dtype": "float32", "shape": (3,), "names": {"motors": ["x", "y", "z"]}}
     action = {"dtype": "float32", "shape": (2,), "names": actions}
     features = {"observation.state": state, "action": action}

@@ -1,4 +1,4 @@
-"""A policy that was pushed comes back by its id on the hub, wherever a run's folder would do."""
+"""A pushed policy can be used by its id on the hub wherever a run's folder can."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ FORMS = (card.AEGIS, card.LEROBOT)
 
 @pytest.fixture(autouse=True)
 def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A hub's cache of this test alone, and a folder without one that is called as ORG."""
+    """A hub cache for this test alone, in a folder without one named ORG."""
     from huggingface_hub import constants
 
     monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "hub-cache"))

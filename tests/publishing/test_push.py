@@ -1,4 +1,4 @@
-"""A pushed policy is the run's, with a card of what was measured, or nothing is sent."""
+"""A pushed policy is the run's, with a card of its measurements, or nothing is sent."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from aegis_cli.training.card import without_places
 
 Aegis = Callable[..., tuple[int, str, str]]
 REPO = "somebody/reach-naive"
-# Files that other backbones' processors have, and some that only a user can have put there.
+# Files that other backbones' processors have, and some that only a user can have added.
 PROCESSOR = {
     "backbone/tokenizer.model",
     "backbone/vocab.txt",
@@ -58,7 +58,7 @@ def run_folder(run_folder: Path, tiny_folder: Path) -> Path:
 
 
 def download(hub: Hub, folder: Path) -> Path:
-    """What a user gets who downloads the repository."""
+    """The files that a user gets by downloading the repository."""
     for name, content in hub.committed.items():
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -194,7 +194,7 @@ def test_the_card_has_what_was_measured(run_folder: Path, hub: Hub) -> None:
     assert f"| reach | seen | 2 | {100 * success:.1f} % (" in body
     assert f"aegis probe {REPO} --baseline" in body and "hf download" not in body
     assert "Options of the method: none." in body
-    # Where the backbone lies here is nothing to others.
+    # The backbone's local path means nothing to others.
     assert "--baseline /" not in body and "model `/" not in body
 
 
@@ -240,7 +240,7 @@ def test_a_card_names_the_backbone_that_came_from_the_hub_and_no_folder(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Whatever folder the card is written from, and what lies there by that name."""
+    """In whatever folder the card is written, and whatever has that name there."""
     name, folder = "someone/SmolVLM", hf_folder("smolvlm")
     training, elsewhere = tmp_path / "training", tmp_path / "elsewhere"
     for place in (training, elsewhere):
@@ -284,7 +284,7 @@ def test_a_card_names_what_the_run_that_it_goes_on_from_began_with(
 def test_a_card_names_no_run_that_others_do_not_have(
     run_folder: Path, demos_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Also after a third run, and where the earlier ones are gone."""
+    """This includes a third run, and earlier runs that are gone."""
     shutil.copytree(run_folder, tmp_path / "runs" / "first", symlinks=True)
     began = Path(recipes.load(run_folder / "recipe.yaml").backbone).name
     monkeypatch.chdir(tmp_path)
@@ -339,7 +339,7 @@ def test_a_card_has_the_success_in_each_suite() -> None:
 def test_a_card_has_the_return_of_a_suite_task_as_a_share_of_the_highest(
     interval: tuple[float, float] | None, said: str
 ) -> None:
-    """As `aegis rollout` reports it, and not as a share of what the demonstrations reached."""
+    """As in `aegis rollout`, and not as a share of what the demonstrations reached."""
     report = rollout.RolloutReport(
         task="suite/cartpole-swingup",
         mean_return=250.0,
@@ -446,9 +446,9 @@ def test_a_card_asks_as_the_run_has_asked(run_folder: Path) -> None:
 def test_a_card_for_lerobot_has_a_command_that_can_run(
     task: str | None, cameras: tuple[str, ...], command: str, run_folder: Path
 ) -> None:
-    """`lerobot-eval` stops without an environment, and ours have one camera.
+    """`lerobot-eval` requires an environment, and ours have one camera.
 
-    A robot acts at 30 frames a second unless LeRobot is told its rate.
+    A robot acts at 30 frames per second unless LeRobot is given its rate.
     """
     recipe = recipes.load(run_folder / "recipe.yaml")
     looks_by = () if task is None else card._looks_by(cast(PolicyMeta, {"cameras": cameras}), task)
@@ -521,7 +521,7 @@ def test_an_offline_hub_is_one_error(
 
 @pytest.mark.parametrize("name", ["alone", "a/b/c", "-a/b", "a/b.git", "a/b--c", "a b/c", "/b"])
 def test_what_is_no_repository_is_refused(name: str, aegis: Aegis, tmp_path: Path) -> None:
-    """Before the run is looked at."""
+    """It is refused before the run is read."""
     assert "ORG/NAME" in refused(aegis("push", "--dry-run", "--", tmp_path, name))
 
 
@@ -529,7 +529,7 @@ def test_what_is_no_repository_is_refused(name: str, aegis: Aegis, tmp_path: Pat
 def exported(
     request: pytest.FixtureRequest, run_folder: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Path, str]:
-    """What `aegis export` wrote, under a name that is no repository's, and its format."""
+    """The output of `aegis export`, under a name that is no repository's, and its format."""
     out = tmp_path_factory.mktemp("exports") / "the arm.v2"
     export.run(run_folder, out, request.param)
     return out, request.param

@@ -1,4 +1,4 @@
-"""A Hugging Face backbone goes out in the type that it came in, or in the one asked for."""
+"""A Hugging Face backbone is exported in its source's dtype, or in the one requested."""
 
 from __future__ import annotations
 
@@ -53,10 +53,10 @@ def backbone_types(folder: Path) -> set[torch.dtype]:
     """Types of the backbone's weights in a model's folder, or an exported one of either layout."""
     (path,) = weight_files(folder)
     tensors = load_file(path)
-    # One file has the whole policy, and a model's folder has nothing but the backbone.
+    # One file has the whole policy, and a model's folder has only the backbone.
     prefix = "model.backbone." if any(n.startswith("model.backbone.") for n in tensors) else ""
     kept = {name: t for name, t in tensors.items() if name.startswith(prefix)}
-    # Rotary frequencies are no weights.
+    # Rotary frequencies are not weights.
     return {t.dtype for name, t in kept.items() if "inv_freq" not in name}
 
 
@@ -155,7 +155,7 @@ def test_an_export_can_be_exported_again(form: str, run_folder: Path, tmp_path: 
 
 
 def test_a_policy_that_was_trained_on_is_written_as_it_is(run_folder: Path, tmp_path: Path) -> None:
-    """What it was stored in before says nothing of its weights of now."""
+    """The dtype in which it was stored before says nothing about its present weights."""
     export.run(run_folder, tmp_path / "x")
     policy, meta = checkpoint.load_policy(tmp_path / "x")
     (tmp_path / "y").mkdir()
@@ -218,7 +218,7 @@ def test_a_merged_model_has_the_type_of_the_fine_tuned_one(
 
 
 def test_a_model_that_was_but_rounded_has_not_moved(tmp_path: Path) -> None:
-    """The base is stored in float32, and what was fine-tuned from it in bfloat16."""
+    """The base is stored in float32, and the model fine-tuned from it in bfloat16."""
     base = write("smolvlm", tmp_path / "base")
     tuned = write("smolvlm", tmp_path / "tuned", dtype=torch.bfloat16)
     settings = MergeSettings("linear", base=str(base))

@@ -1,4 +1,4 @@
-"""Texts that are no YAML, or that cost more than a recipe may: one error, at once."""
+"""Texts that are no YAML, or that are larger than a recipe may be: one error, immediately."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_it_is_one_error(text: str, found: str) -> None:
     with pytest.raises(AegisError, match=found) as caught:
         parse(text, "small.yaml")
     assert caught.value.found.startswith("small.yaml:") and caught.value.fix
-    assert time.process_time() - started < 20  # a bomb that goes off takes hours
+    assert time.process_time() - started < 20  # expanding the bomb would take hours
 
 
 def test_aliases_are_no_fault() -> None:
@@ -61,7 +61,7 @@ def test_a_text_or_list_of_another_type_is_named(value: str, tmp_path: Path) -> 
 
 
 def said(value: object) -> object:
-    """A value with the line of each of its keys."""
+    """A value with the line number of each of its keys."""
     if isinstance(value, dict):
         return [(name, line_of(value, name), said(inner)) for name, inner in value.items()]
     return [said(item) for item in value] if isinstance(value, list) else value
@@ -70,7 +70,7 @@ def said(value: object) -> object:
 def test_a_recipe_is_the_same_without_libyaml(monkeypatch: pytest.MonkeyPatch) -> None:
     texts = [path.read_text(encoding="utf-8") for path in SHIPPED.glob("*.yaml")]
     assert len(texts) > 10
-    # Keys given twice, scalars of YAML 1.2, quotes, a merge, and many lines.
+    # Duplicate keys, scalars of YAML 1.2, quotes, a merge, and many lines.
     texts += ["a: no\nb: 1e-4\na: 010\nc: [2024-01-01, ~, .inf, 'x: y']\nd: &d {e: 1}\nf: {<<: *d}"]
     texts += [dump({"words": ["yes", "über", "1.0", "a: b", "# c", "x" * 200 + " y"]}), "# nothing"]
     with_it = [parse(text, "small.yaml") for text in texts]

@@ -1,4 +1,4 @@
-"""What a recipe may say of a merge after the training."""
+"""Recipe settings for a merge after the training."""
 
 from __future__ import annotations
 

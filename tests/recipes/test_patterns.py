@@ -1,4 +1,4 @@
-"""Patterns of dotted names: what each stands for, and what is none."""
+"""Patterns of dotted names: what each matches, and what is not a pattern."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def test_a_recipe_with_no_pattern_is_refused(written: str, tmp_path: Path) -> No
 
 
 def test_what_is_frozen_is_part_of_what_shapes_the_training() -> None:
-    """And the records of runs that were made before there was the key still hold."""
+    """And the records of runs from before the key existed remain valid."""
     plain = recipes.training_part(Recipe("r"))["train"]
     assert "freeze" not in plain
     frozen = recipes.from_mapping({"name": "r", "train": {"freeze": "vision"}})

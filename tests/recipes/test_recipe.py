@@ -1,4 +1,4 @@
-"""Recipes: strict reading, all errors at once, and a lossless way back to YAML."""
+"""Recipes: strict reading, all errors at once, and a lossless conversion back to YAML."""
 
 from __future__ import annotations
 
@@ -469,9 +469,9 @@ def test_a_shipped_recipe_says_its_kind_and_an_older_one_without_it_is_the_same(
     line = f"kind: {name_of(type(shipped))}\n"
     assert line in text and to_yaml(shipped).startswith(line)
     if isinstance(shipped, RobotStreamStudyRecipe):
-        return  # a kind that every file of it has said
+        return  # every file of this kind has named it
     older = write(tmp_path, text.replace(line, ""))
-    if not isinstance(shipped, PretrainRecipe):  # `aegis pretrain` alone reads these by default
+    if not isinstance(shipped, PretrainRecipe):  # only `aegis pretrain` reads these by default
         assert study_cells.load_any(older) == shipped
     assert digest(load_shipped(older.rename(tmp_path / path.name))) == digest(shipped)
 
@@ -505,7 +505,7 @@ def test_a_retired_key_is_read_and_recorded_but_written_only_with_a_value_of_its
     plain, own = (load(write(tmp_path, text.format(every))) for every in (10, 3))
     assert "leak" not in to_yaml(plain) and "leak_every: 3" in to_yaml(own)
     assert load(write(tmp_path, to_yaml(own))) == own
-    assert training_part(plain)["train"]["leak_every"] == 10  # as the runs before have it
+    assert training_part(plain)["train"]["leak_every"] == 10  # as in runs from before
 
 
 @pytest.mark.parametrize("kind", [k.recipe for k in KINDS.values()], ids=list(KINDS))
@@ -569,7 +569,7 @@ def test_an_option_of_a_method_that_another_takes_all_effect_from_is_refused(
     load(write(tmp_path, "name: x"), without)
     told = refusal(tmp_path, "name: x", *without, *settings)
     assert told.found.startswith(found), told.found
-    load(write(tmp_path, "name: x"), settings)  # alone each of them is fine
+    load(write(tmp_path, "name: x"), settings)  # each of them alone is fine
 
 
 def test_a_stream_of_robot_tasks_has_no_gate_and_says_so(tmp_path):
@@ -578,10 +578,9 @@ def test_a_stream_of_robot_tasks_has_no_gate_and_says_so(tmp_path):
 
 
 def test_an_option_is_left_out_of_keys_at_the_default_that_it_came_with() -> None:
-    """A digest is not at today's defaults, but at those that an option came with.
+    """A digest does not use today's defaults, but those that an option had when it was added.
 
-    What was measured under the old default does not pass for the new one, nor need it be measured
-    again.
+    Measurements under the old default do not count for the new one, and need not be repeated.
     """
 
     @dataclasses.dataclass(frozen=True)
@@ -595,7 +594,7 @@ def test_an_option_is_left_out_of_keys_at_the_default_that_it_came_with() -> Non
 
 
 def test_a_key_that_came_later_is_no_part_of_a_record_until_it_is_used():
-    """So that what ran before there was the key is still up to date."""
+    """So results from before the key existed are still up to date."""
 
     @dataclasses.dataclass(frozen=True)
     class Section:

@@ -1,4 +1,4 @@
-"""The recipes that come with Aegis, by their names."""
+"""The recipes that are shipped with Aegis, by name."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Studies as files: what is refused, all of it at once, and what a cell's recipe is."""
+"""Studies as files: what is refused, all at once, and the recipes of their cells."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def with_variant(**keys: Any) -> dict[str, Any]:
 
 
 def test_every_value_of_a_knob_has_a_folder_of_its_own(tmp_path: Path) -> None:
-    """Also one of dots, of none of a name's characters, or longer than a name may be."""
+    """This includes values of only dots, without valid characters, or longer than a name may be."""
     values = ("a/b", "a_b", ".", "..", "/", "?", "ä" * 200, "ä" * 300, 1e-3, "_._", None)
     variants = {"x": SimpleNamespace(values=values)}
     kind: Any = SimpleNamespace(
@@ -355,13 +355,13 @@ def test_the_shipped_studies_compare_what_they_promise() -> None:
         study_cells.load(RECIPES / f"{name}.yaml") for name in ("compare", "ablations")
     )
     compared = [name for name, v in compare.variants.items() if v.method == name]
-    # In the order of tables. A method that is new may still be without a place in a study.
+    # In the order of tables. A new method may still lack a place in a study.
     assert compared == [name for name in recipes.METHODS if name in compared]
     assert len(compared) >= 11 and "insulate" not in compared  # that is in rivals.yaml
     knobs = {name: len(v.values) for name, v in compare.variants.items() if v.tune}
     assert knobs.pop("naive") == 4 and set(knobs.values()) == {
         3
-    }  # one more for whom all are measured against
+    }  # one more: the reference for all of them
     assert len(ablations.seeds) == 2 and ablations.tuning is None
     cells = [study_cells.cell(ablations, name, "reach", 0) for name in ablations.variants]
     assert len({str(cell) for cell in cells}) == len(cells) and "naive" in ablations.variants
@@ -416,7 +416,7 @@ def test_from_ewc_to_kfac_one_change_at_a_time() -> None:
 
 
 def without_bootstraps(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Leave out the tables' second interval: of all shipped cells it takes more than a minute."""
+    """Skip the tables' second interval: for all shipped cells it takes more than a minute."""
     monkeypatch.setattr(metrics, "crossed_interval", lambda *_, **__: None)
 
 
@@ -445,10 +445,10 @@ def without_bootstraps(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_every_shipped_cell_is_still_found_by_its_key(
     name: str, entries: int, cells: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A change that makes finished cells stale, or lets them pass for others, has to move them too.
+    """A change that makes finished cells stale, or swaps them, has to move them too.
 
     The studies are run on the shipped figures alone: a cell that is not found would be trained.
-    Cells that are equal have one entry.
+    Equal cells share one entry.
     """
     fake_bench(monkeypatch)
     without_bootstraps(monkeypatch)
@@ -490,7 +490,7 @@ def test_every_shipped_cell_is_still_found_by_its_key(
 def test_every_shipped_entry_is_a_cell_of_its_study(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Some are of values that are not chosen any more since another seed has been added."""
+    """Some have values that are no longer chosen since another seed was added."""
     without_bootstraps(monkeypatch)
     study = study_cells.load(RECIPES / f"{name}.yaml")
     kind = stage.kind_of(study)
@@ -518,7 +518,7 @@ def test_every_shipped_entry_is_a_cell_of_its_study(
 
 
 def without_seeds(**changes: Any) -> dict[str, Any]:
-    """The keys of a study whose shared sections leave their seeds to it."""
+    """The keys of a study whose shared sections contain no seeds."""
     keys = raw("embedded", **changes)
     for section in ("demos", "anchor", "probe", "rollout"):
         del keys["shared"][section]["seed"]

@@ -1,4 +1,4 @@
-"""`aegis compare`: one table of several runs, with the figures that their stages wrote."""
+"""`aegis compare`: one table of several runs, with the figures written by their stages."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def test_a_job_stands_for_its_runs(job: Path) -> None:
 
 
 def test_a_folder_stands_for_the_runs_in_it(job: Path, tmp_path: Path) -> None:
-    """As far as they have a checkpoint; a job, a stream and an artifact among them are no runs."""
+    """Only folders with a checkpoint count; a job, a stream and an artifact are not runs."""
     folder = tmp_path / "runs"
     for name in ("b", "a"):
         shutil.copytree(job / "naive", folder / name, symlinks=True)
@@ -85,7 +85,7 @@ def test_a_run_that_is_not_finished_says_of_how_many_steps(
 
 
 def test_only_a_run_with_its_training_state_is_said_to_go_on(job: Path) -> None:
-    """A merged run has none, nor has one whose checkpoints were removed."""
+    """A merged run has none, nor does one whose checkpoints were removed."""
     merged, going, gone = job / "naive", job / "aegis", write_job(job) / "aegis"
     for run in (merged, going, gone):
         recipe = (run / "recipe.yaml").read_text(encoding="utf-8")
@@ -127,7 +127,7 @@ def test_the_set_that_all_runs_were_probed_on_is_compared(job: Path) -> None:
 
 @pytest.mark.parametrize("passed", [True, False, None])
 def test_the_gate_is_that_of_the_drop_beside_it(passed: bool | None, job: Path) -> None:
-    """The first probe of a run is shown, which a gate on others says nothing of."""
+    """The run's first probe is shown; a gate on other questions does not apply to it."""
     run = job / "naive"
     (run / "probe.json").unlink()
     for which, verdict in (("a", passed), ("b", False), ("c", True)):
@@ -177,7 +177,7 @@ def test_open_loop_errors_on_the_same_episodes_are_compared(
 def test_open_loop_errors_on_other_frames_are_not_compared_without_a_word(
     other: dict[str, object], told: str, aegis, job: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Also where as many episodes of the same data were held out."""
+    """This holds even if equally many episodes of the same data were held out."""
     monkeypatch.chdir(job)
     for name, own in (("naive", open_loop(1)), ("aegis", {**open_loop(1, error=0.5), **other})):
         results.keep(job / name, "evaluate-validation-arm", own, {"path": "/arm"})
@@ -192,7 +192,7 @@ def test_open_loop_errors_on_other_frames_are_not_compared_without_a_word(
 def test_what_aegis_run_has_evaluated_is_told_apart_by_where_its_data_lies(
     same: bool, job: Path, tmp_path: Path
 ) -> None:
-    """Its figures name the data as the recipe does, which may be any folder's `arm`."""
+    """Its figures name the data like the recipe, which may be any folder's `arm`."""
     places = [tmp_path / "a" / "arm"] * 2 if same else [tmp_path / "a/arm", tmp_path / "b/arm"]
     for name, place in zip(("naive", "aegis"), places):
         files.save_json(job / name / "evaluate.json", open_loop(1))
@@ -223,7 +223,7 @@ def test_success_in_other_episodes_is_shown_without_a_mark(
 
 
 def test_success_is_that_in_the_runs_own_task(job: Path) -> None:
-    """Whatever was played last: a policy of LIBERO's plays other suites too."""
+    """This holds whatever was played last: a policy of LIBERO's plays other suites too."""
     (job / "aegis" / "rollout-seen.json").unlink()
     for name, task, success in (("rollout", "reach", 0.25), ("rollout-point", "point", 1.0)):
         found = rollout("seen", success) | {"task": task}
@@ -247,7 +247,7 @@ def test_answers_to_other_questions_are_shown_without_a_mark(
 def test_two_files_of_one_name_are_two_sets_of_questions(
     majority: float, aegis, job: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Any folder may have its own.jsonl; the commonest answers' shares are the questions' own."""
+    """Any folder may have its own.jsonl; the most common answers' shares differ by questions."""
     monkeypatch.chdir(job)
     for number, name in enumerate(("naive", "aegis")):
         figures = probe("x", number)
@@ -276,7 +276,7 @@ def test_the_command_shows_one_line_a_run(
     lines = [line for line in out.splitlines() if line.startswith((" naive", " aegis"))]
     assert code == 0 and len(lines) == 2
     assert "80.0" in lines[0] and "20.00" in lines[1] and "failed" in lines[1]
-    assert "Return" not in out  # which none of them has
+    assert "Return" not in out  # which none of the runs has
     code, out, _ = aegis("compare", job, "--json")
     assert [row["drop_points"] for row in json.loads(out)["rows"]] == [10.0, 20.0]
 

@@ -1,4 +1,4 @@
-"""What runs do not share beside their methods, which a comparison says."""
+"""Differences between runs besides their methods, which a comparison reports."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from aegis_cli.reporting import compare, differences
 
 
 def changed_run(folder: Path, digest: str = "a" * 64, steps: int = 6, **changes: Any) -> Path:
-    """A run that differs from others in some of what it was made from."""
+    """A run that differs from others in some of its inputs."""
     run = write_job(folder, **changes) / "naive"
     header = artifacts.load(run / "ledger.safetensors", "ledger")
     inputs, meta = {"demos": digest, "backbone": "b" * 64}, header.header.meta

@@ -37,7 +37,7 @@ def policy() -> Policy:
 
 
 def gradients(model: Policy, seed: int, guard: Guard | None) -> list[Tensor]:
-    """Those of the state's map, after one backward pass."""
+    """The gradients of the state's map after one backward pass."""
     pixels, ids, mask = batch(seed)
     if guard is None:
         (model(pixels, ids, mask) - 1).square().mean().backward()

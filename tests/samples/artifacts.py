@@ -155,7 +155,7 @@ def forge(
 ) -> None:
     """Rewrite a file with another program: change its header's JSON and some tensors.
 
-    It then has no digest, as files of before there was one.
+    The result has no digest, like files from before digests existed.
     """
     with safetensors.safe_open(path, "pt") as file:
         header = json.loads(file.metadata()["aegis"])

@@ -1,4 +1,4 @@
-"""An untrained VLM that says different things, and questions for it."""
+"""An untrained VLM that gives varied answers, and questions for it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ LONGEST = "which color does the ball have"
 
 
 def outspoken_tiny() -> EmbeddedVLM:
-    """The untrained VLM with stronger layers, whose answers differ and hold no padding."""
+    """The untrained VLM with stronger layers, so that its answers differ and contain no padding."""
     model = make_tiny()
     with torch.no_grad():
         for weight in (

@@ -1,4 +1,4 @@
-"""The command in a process of its own, and what a refusal looks like."""
+"""The command in a process of its own, and what an error looks like."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ ROOT = Path(__file__).parent.parent.parent
 
 @cache
 def command() -> Callable[..., Any]:
-    """What `app` makes of its commands whenever it is called, which takes a moment; made once."""
+    """The click command that `app` builds whenever it is called, which is slow; built once."""
     return typer.main.get_command(app)
 
 
 def finding(*folders: Path) -> dict[str, str]:
     """An environment in which Python finds modules in these folders first.
 
-    What PYTHONPATH has already stays behind them: packages may be found by it alone.
+    The entries of PYTHONPATH stay behind them, since some packages may be found only there.
     """
     paths = [*map(str, folders), os.environ.get("PYTHONPATH")]
     return os.environ | {"PYTHONPATH": os.pathsep.join(path for path in paths if path)}
@@ -39,7 +39,7 @@ def python(code: str) -> subprocess.CompletedProcess:
 
 
 def refused(result: tuple[int, str, str]) -> str:
-    """The error block, after a check that a user saw nothing else: exit 2, no traceback."""
+    """The error block, after a check that the user saw nothing else: exit code 2, no traceback."""
     code, out, err = result
     assert (code, out) == (2, "")
     assert "Traceback" not in err

@@ -1,4 +1,4 @@
-"""The fenced blocks of the README and of docs/, what is said of each, and the commands in them."""
+"""The fenced blocks of the README and of docs/, their comments, and the commands in them."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ PAGES = {
     str(path.relative_to(ROOT)): path.read_text(encoding="utf-8")
     for path in (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(ROOT.glob("docs/**/*.md")))
 }
-TRIED = ("sh", "python")  # languages of blocks that somebody may want to copy
+TRIED = ("sh", "python")  # languages of the blocks that a reader may want to copy
 OTHERS = {"text", "json", "yaml"}
 NOT_RUN, PARSED, NEEDS = "not run", "parsed only", "needs"
 
 
 @dataclass(frozen=True)
 class Block:
-    """A fenced block of a page and what the comment before it says."""
+    """A fenced block of a page, and the text of the comment before it."""
 
     page: str
     line: int
@@ -38,7 +38,7 @@ FENCE = re.compile(
 
 
 def blocks(page: str) -> list[Block]:
-    """The page's blocks in their order."""
+    """The page's blocks in order."""
     text = PAGES[page]
     return [
         Block(

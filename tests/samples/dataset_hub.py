@@ -1,4 +1,4 @@
-"""A stand-in of what huggingface_hub downloads from the hub, for one dataset."""
+"""A stand-in for what huggingface_hub downloads from the hub, for one dataset."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from huggingface_hub.utils import filter_repo_objects
 
 
 class DatasetHub:
-    """A hub of one dataset, whose files are those of a local folder.
+    """A hub with one dataset, whose files are those of a local folder.
 
     Attributes:
         repository: that folder; local: where its files are downloaded to.
-        asked: the patterns of each download, in their order.
-        lacks: what is raised for any other name.
-        fails: what is raised where it is asked for its list of files; None: it answers.
+        asked: the patterns of each download, in order.
+        lacks: the exception for any other name.
+        fails: the exception for a request for the list of files; None: the request succeeds.
     """
 
     def __init__(self, name: str, repository: Path, local: Path) -> None:
@@ -26,7 +26,7 @@ class DatasetHub:
         self.fails: Exception | None = None
 
     def files(self, name: str, repo_type: str) -> list[str]:
-        """In place of `list_repo_files`."""
+        """Replaces `list_repo_files`."""
         assert repo_type == "dataset"
         if self.fails is not None:
             raise self.fails
@@ -43,7 +43,7 @@ class DatasetHub:
         ignore_patterns: list[str],
         local_files_only: bool,
     ) -> str:
-        """In place of `snapshot_download`, which remembers what files there are."""
+        """Replaces `snapshot_download`, which remembers which files exist."""
         assert repo_type == "dataset"
         self.asked.append(allow_patterns)
         if name != self.name:
@@ -61,5 +61,5 @@ class DatasetHub:
 
     @property
     def downloaded(self) -> set[str]:
-        """Names of the files that are here."""
+        """Names of the files that have been downloaded."""
         return {path.name for path in self.local.rglob("*.*")}

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 
 @contextmanager
 def disk(free: int) -> Iterator[None]:
-    """No file may grow beyond `free` bytes: what a full disk looks like to a program."""
+    """No file can grow beyond `free` bytes, which to a program looks like a full disk."""
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (free, limits[1]))
     try:

@@ -1,8 +1,8 @@
 """Which tests belong to `pytest -m fast`: about 1,200 that run in about a minute on two cores.
 
-The rule: all of the rooms whose tests are pure computation, less the files that repeat it over many
-draws, and of each other room one or more files that neither train nor render. A file belongs as a
-whole, unless single tests of it are named.
+The rule: all rooms whose tests are pure computation, except the files that repeat it over many
+draws, and one or more files of every other room that neither train nor render. Files are listed as
+a whole, unless single tests of them are named.
 """
 
 from __future__ import annotations

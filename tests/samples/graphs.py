@@ -1,4 +1,4 @@
-"""Whether a training keeps what it computed, and what it compiles.
+"""Whether a training keeps the graphs of its steps, and what it compiles.
 
 A graph that outlives its step costs its activations, once per step.
 """
@@ -19,7 +19,7 @@ from aegis_cli.models.expert import ActionExpert
 
 
 def outputs_kept(work: Callable[[], object]) -> tuple[int, int]:
-    """How many outputs of modules with a graph `work` made, and how many are left after it."""
+    """How many outputs with a graph the modules made during `work`, and how many are left after."""
     made: list[weakref.ref[Tensor]] = []
 
     def note(module: nn.Module, given: Any, output: Any) -> None:
@@ -36,7 +36,7 @@ def outputs_kept(work: Callable[[], object]) -> tuple[int, int]:
 
 
 def compiled_graphs(monkeypatch: pytest.MonkeyPatch) -> list[object]:
-    """Will hold each graph that a training of the embedded family compiles, which it then runs."""
+    """A list that receives each graph that a training of the embedded family compiles and runs."""
     found: list[object] = []
 
     def noted(graph: Any, _: object) -> Any:
@@ -50,7 +50,7 @@ def compiled_graphs(monkeypatch: pytest.MonkeyPatch) -> list[object]:
 
 
 class Keeper(nn.Module):
-    """What must be found: a hook on an output that holds the output."""
+    """What must be found: a hook on an output that keeps the output alive."""
 
     def forward(self, x: Tensor) -> Tensor:
         y = 2 * x

@@ -1,4 +1,4 @@
-"""A model that is not ours: two transformer layers over image and text, in several builds."""
+"""A model that is not ours: two transformer layers over image and text, in several variants."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ Batch = tuple[Tensor, Tensor, Tensor]
 def batch(seed: int, size: int = 4, dtype: torch.dtype = torch.float64) -> Batch:
     """Pixels, words and a mask.
 
-    The second row ends in two padding words, which no question contains.
+    The second row ends in two padding tokens, which occur in no question.
     """
     generator = torch.Generator().manual_seed(seed)
     ids = torch.randint(2, WORDS - 3, (size, TEXT), generator=generator)
@@ -119,7 +119,7 @@ def measured(model: nn.Module, path: Path, **options: Any) -> Path:
 
 
 def anchors_by_method(folder: Path) -> dict[str, Path]:
-    """The anchor that each of the guard's methods reads."""
+    """The anchors that the guard's methods read, by method."""
     both = measured(make(), folder / "both.safetensors")
     model = make()
     with Guard.measure(model, parts=("curvature",), energy=1.0) as found:
@@ -132,7 +132,7 @@ def anchors_by_method(folder: Path) -> dict[str, Path]:
 
 
 def guarded_steps(model: nn.Module, guard: Guard, steps: int = 3, **adam: Any) -> list[float]:
-    """Train with the guard, a batch a step."""
+    """Train with the guard, one batch per step."""
     optimizer = torch.optim.AdamW(
         [p for p in model.parameters() if p.requires_grad], **({"lr": 1e-2} | adam)
     )
@@ -153,12 +153,12 @@ def vector(model: nn.Module) -> Tensor:
 
 
 def compiling(test: Callable[..., None]) -> Callable[..., None]:
-    """A test that compiles: the compiler's own warnings are not ours."""
+    """Mark a test that compiles: warnings of the compiler itself are not ours."""
     for message in ("The .grad attribute of a Tensor", "`torch.jit.script_method` is deprecated"):
         test = pytest.mark.filterwarnings(f"ignore:{message}")(test)
     return test
 
 
 def through_checkpoint(reentrant: bool) -> Callable[..., Any]:
-    """Layers run inside a checkpoint, and their hooks with them."""
+    """Run layers inside a checkpoint, together with their hooks."""
     return lambda layer, *inputs: checkpoint(layer, *inputs, use_reentrant=reentrant)

@@ -1,4 +1,4 @@
-"""Two small models for the guard: one of nobody's making, one of PaliGemma 2's architecture."""
+"""Two small models for the guard: one of our own, one of PaliGemma 2's architecture."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def small_batches(seed: int) -> list[tuple[Tensor, ...]]:
 
 
 def small_vlm(anchor: Path) -> SmallVlm:
-    """A model with fixed weights, whose anchor is written."""
+    """A model with fixed weights; its anchor is written to `anchor`."""
     torch.manual_seed(0)
     model = SmallVlm().eval()
     with Guard.measure(model, layers="text.layers") as measured:
@@ -79,7 +79,7 @@ def small_vlm(anchor: Path) -> SmallVlm:
 
 
 def save_small_paligemma(folder: Path) -> None:
-    """PaliGemma 2's architecture with random weights, as its owner would have it on disk."""
+    """PaliGemma 2's architecture with random weights, as a user would have it on disk."""
     from transformers import PaliGemmaConfig, PaliGemmaForConditionalGeneration
 
     common = {
@@ -135,7 +135,7 @@ def paligemma_batches(seed: int) -> list[dict[str, Tensor]]:
 
 
 def measured_paligemma(folder: Path) -> nn.Module:
-    """The model of `save_small_paligemma` in a folder's own place, its anchor beside it."""
+    """The model of `save_small_paligemma` in a folder of its own, with its anchor beside it."""
     from transformers import AutoModelForImageTextToText
 
     saved = folder / "path" / "to" / "paligemma2"

@@ -52,7 +52,7 @@ SPECIAL = [
 
 @cache
 def _bpe() -> str:
-    """A byte-level BPE that has learnt the questions' words, as JSON."""
+    """A byte-level BPE that has learned the questions' words, as JSON."""
     tokenizer = Tokenizer(models.BPE())
     tokenizer.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False)
     tokenizer.decoder = decoders.ByteLevel()
@@ -291,7 +291,7 @@ def _qwen2(**changes: Any) -> tuple[Any, Any]:
 
 
 def _qwen3(**changes: Any) -> tuple[Any, Any]:
-    """Its vision tower hands features to the first language layers too."""
+    """Its vision tower also passes features to the first language layers."""
     tokenizer = make_tokenizer("<|im_end|>")
     images = _qwen_images()
     processor = without_video(transformers.Qwen3VLProcessor, images, tokenizer, QWEN)
@@ -338,7 +338,7 @@ _CLIP = {
 
 
 def _llava_1_5(**changes: Any) -> tuple[Any, Any]:
-    """It reads what CLIP's last layer but one says, so that the last takes no part."""
+    """It reads the output of CLIP's last layer but one, so the last layer is unused."""
     from transformers.models.clip.image_processing_pil_clip import CLIPImageProcessorPil
 
     tokenizer = make_tokenizer("<|im_end|>", image_token="<image>")
@@ -394,7 +394,7 @@ def _llava_next(**changes: Any) -> tuple[Any, Any]:
 
 
 def _internvl(**changes: Any) -> tuple[Any, Any]:
-    """Its positions are a table that no module of torch's looks up."""
+    """Its positions are a table that no torch module looks up."""
     from transformers.models.got_ocr2.image_processing_pil_got_ocr2 import (
         GotOcr2ImageProcessorPil,
     )
@@ -426,7 +426,7 @@ def _internvl(**changes: Any) -> tuple[Any, Any]:
 
 
 def _gemma3(**changes: Any) -> tuple[Any, Any]:
-    """Its layers with a window have a rotary embedding of their own."""
+    """Its sliding-window layers have their own rotary embedding."""
     from transformers.models.gemma3.image_processing_pil_gemma3 import Gemma3ImageProcessorPil
 
     named = {"boi_token": GEMMA_IMAGE, "eoi_token": "<|vision_end|>"}
@@ -465,8 +465,8 @@ def _gemma3(**changes: Any) -> tuple[Any, Any]:
 
 
 def _mistral3(**changes: Any) -> tuple[Any, Any]:
-    """Its processor is one of those that torchvision is needed for."""
-    import pytest  # here, since plugins/check makes models too, without it
+    """Its processor is one of those that need torchvision."""
+    import pytest  # here, since plugins/check makes models without pytest
 
     pytest.importorskip("torchvision", exc_type=ImportError)
     tokenizer = make_tokenizer("<|im_end|>", image_token="<image>")
@@ -506,12 +506,12 @@ FAMILIES: dict[str, Callable[..., tuple[Any, Any]]] = {
     "gemma3": _gemma3,
     "mistral3": _mistral3,
 }
-# Those of which nothing can be made without torchvision.
+# Families of which nothing can be made without torchvision.
 WITH_TORCHVISION = {"mistral3"}
 
 
 def without_video(kind: type, images: Any, tokenizer: Any, template: str, **options: Any) -> Any:
-    """The family's processor on a machine without torchvision, which its video part would need."""
+    """The family's processor on a machine without torchvision, which only its video part needs."""
 
     class Images(kind):  # type: ignore[misc, valid-type]
         def check_argument_for_proper_class(self, name: str, argument: Any) -> Any:
@@ -552,7 +552,7 @@ def write(
             for name, parameter in model.named_parameters():
                 if (
                     parameter.ndim == 1
-                ):  # norms and biases: at their plain starting values they would hide mistakes
+                ):  # norms and biases: their usual initial values would hide mistakes
                     parameter += 0.1 * torch.randn_like(parameter)
                 elif "lm_head" not in name and "embed_tokens" not in name:
                     parameter.copy_(torch.randn_like(parameter) / parameter[0].numel() ** 0.5)
@@ -565,7 +565,7 @@ def write(
 
 
 def load_processor(family: str, folder: Path) -> Any:
-    """As a user of transformers puts it together here, without the code under test."""
+    """The processor as a user of transformers would build it, without the code under test."""
     written = (folder / "chat_template.jinja").exists()
     if not written or family == "idefics3" or is_torchvision_available():
         return transformers.AutoProcessor.from_pretrained(folder)
@@ -574,7 +574,7 @@ def load_processor(family: str, folder: Path) -> Any:
 
 
 def prompt_of(family: str, text: str, images: int = 1) -> str:
-    """What a family's own documentation has one write for a question about images."""
+    """The prompt for a question about images according to the family's own documentation."""
     pads = "<|vision_start|><|image_pad|><|vision_end|>" * images
     return {
         "paligemma": f"{'<image>' * images}answer en {text}",

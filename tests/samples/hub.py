@@ -1,4 +1,4 @@
-"""A stand-in of the Hugging Face hub's HTTP interface, for commits and downloads."""
+"""A stand-in for the Hugging Face hub's HTTP interface, for commits and downloads."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ COMMIT = "0" * 40
 
 
 class Hub:
-    """What the stand-in has been sent, and how it answers.
+    """What the stand-in has received, and how it answers.
 
     Attributes:
-        committed: the files by their paths, after all commits.
-        created: what a repository was asked for with; None before that.
+        committed: the files by path, after all commits.
+        created: the request that created the repository; None before it.
         card_error: what is wrong with the head of every card.
-        public: whether the repository is there already, and public.
-        downloaded: the paths of the files that were sent, in their order.
+        public: whether the repository already exists and is public.
+        downloaded: the paths of the files that were sent, in order.
     """
 
     def __init__(self) -> None:
@@ -62,7 +62,7 @@ class Hub:
         return 200, found | {"private": not self.public, "siblings": files}
 
     def file(self, path: str) -> bytes | None:
-        """What is downloaded under a path; None: no file's."""
+        """The content to download for a path; None if there is no such file."""
         _, resolve, name = path.partition("/resolve/")
         return self.committed.get(name.partition("/")[2]) if resolve else None
 
@@ -146,7 +146,7 @@ def serving() -> Iterator[Hub]:
 
 @pytest.fixture
 def hub(monkeypatch: pytest.MonkeyPatch) -> Iterator[Hub]:
-    """The stand-in in the hub's place, with a token that it takes."""
+    """The stand-in in place of the hub, with a token that it accepts."""
     from huggingface_hub import constants
 
     monkeypatch.setenv("HF_TOKEN", TOKEN)

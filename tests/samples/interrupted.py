@@ -1,4 +1,4 @@
-"""A job that is interrupted at one place after another, and goes on after each of them."""
+"""A job that is interrupted at one place after another and resumed after each."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ def stop(stage: str, at: int, event: Progress) -> None:
 
 
 def at_each(places: Sequence[Place], start: Callable[..., Any]) -> Iterator[Place]:
-    """Interrupt a job at each of these places, which come in this order, and yield it there.
+    """Interrupt a job at each of these places, which are in order, and yield each place there.
 
     Args:
-        start: called with `on_event` and, if something of the job is done, with `resume=True`.
+        start: called with `on_event` and, if part of the job is done, with `resume=True`.
     """
     for number, place in enumerate(places):
         torch.manual_seed(99 + number)  # another process has another random state

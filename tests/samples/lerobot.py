@@ -1,4 +1,4 @@
-"""LeRobot datasets of noise, small enough for every test, and their files taken apart."""
+"""LeRobot datasets of noise, small enough for every test, and ways to take their files apart."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ SPEC = Spec(10.0, STATE, ACTION, "arm")
 
 @pytest.fixture
 def frame_cache(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Decoded frames of every test lie in a folder of its own."""
+    """Put every test's decoded frames into a folder of its own."""
     folder = tmp_path_factory.mktemp("cache")
     monkeypatch.setenv("AEGIS_CACHE", str(folder))
     return folder
@@ -41,7 +41,7 @@ def episodes(
     smooth: bool = False,
     texts: Sequence[str] = TEXTS,
 ) -> list[NewEpisode]:
-    """Episodes of 1 to 9 frames of noise; `smooth` frames have one colour, fit for video."""
+    """Episodes of 1 to 9 frames of noise; `smooth` frames have one colour, suitable for video."""
     rng = np.random.default_rng(seed)
 
     def pictures(length: int) -> np.ndarray:
@@ -96,9 +96,9 @@ def read(folder: Path, camera: str | None = None, side: int | None = None) -> np
 
 
 def as_version_2(folder: Path, version: str) -> Path:
-    """Make a dataset of version v3.0 one of v2.0 or v2.1, two episodes a chunk.
+    """Convert a dataset of version v3.0 to v2.0 or v2.1, with two episodes per chunk.
 
-    Videos are taken as they are, so each must hold one episode.
+    Videos are kept as they are, so each must hold one episode.
     """
     meta, info = folder / "meta", json.loads((folder / "meta/info.json").read_text())
     rows = parquet.read_table(meta / "episodes/chunk-000/file-000.parquet").to_pylist()
@@ -137,7 +137,7 @@ def _move_videos(folder: Path, info: dict[str, Any], rows: list[dict[str, Any]])
 
 
 def _share_rows(folder: Path, count: int) -> None:
-    """A parquet file for each episode."""
+    """Write a parquet file for each episode."""
     table = pa.concat_tables([parquet.read_table(path) for path in data_files(folder)])
     shutil.rmtree(folder / "data")
     of = table.column("episode_index").to_numpy()
@@ -148,7 +148,7 @@ def _share_rows(folder: Path, count: int) -> None:
 
 
 def _stats_row(row: dict[str, Any]) -> dict[str, Any]:
-    """An episode's figures as version 2.1 has them, which knew no quantiles."""
+    """An episode's statistics in the format of version 2.1, which had no quantiles."""
     stats: dict[str, dict[str, Any]] = {}
     for name, value in row.items():
         if name.startswith("stats/") and not name.rpartition("/")[2].startswith("q"):
@@ -204,10 +204,10 @@ def otherwise(folder: Path, copy: Path, names: dict[str, str]) -> Path:
 
 
 class ReachArm:
-    """What LeRobot's robots have, of `reach`'s arm that does not move.
+    """What LeRobot's robots provide, for `reach`'s arm, which does not move.
 
     Attributes:
-        sent: the actions, as they came.
+        sent: the actions, in order.
     """
 
     def __init__(self) -> None:

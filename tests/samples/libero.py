@@ -1,4 +1,4 @@
-"""Whether LIBERO's tasks can be made here: its package, and its meshes, which come from the hub."""
+"""Whether LIBERO's tasks can be made here: they need its package and meshes from the hub."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from aegis_cli.common.errors import AegisError
 
 
 def _missing() -> str:
-    """Why they cannot be made; empty if they can."""
+    """Why they cannot be made; empty if they can be."""
     try:
         import_module("aegis_cli.sim.libero")._check_assets()
     except AegisError as error:

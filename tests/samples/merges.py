@@ -23,7 +23,7 @@ SAMPLES = 14  # for an anchor
 
 
 class Place(NamedTuple):
-    """A run beside its demonstrations, as `aegis run` leaves them; read only."""
+    """A run beside its demonstrations, as `aegis run` leaves them; read-only."""
 
     base: Path
     run: Path

@@ -10,7 +10,7 @@ from aegis_cli.common.errors import AegisError
 
 
 def _missing() -> str:
-    """Why they cannot be made; empty if they can."""
+    """Why they cannot be made; empty if they can be."""
     try:
         import_module("aegis_cli.sim.metaworld")
     except AegisError as error:

@@ -1,4 +1,4 @@
-"""One module of each kind that an anchor describes, whose inputs span part of what it reads."""
+"""One module of each kind that an anchor describes; the inputs span only part of its space."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Toy(nn.Module):
 class Case:
     """One site's inputs.
 
-    `vqa` draws inputs of the protected span, new ones at every call, and `any` inputs that span
+    `vqa` draws new inputs of the protected span at every call, and `any` draws inputs that span
     everything.
     """
 
@@ -138,7 +138,7 @@ def case(request: pytest.FixtureRequest) -> Case:
 
 
 def rows_of(module: nn.Module, x: Tensor) -> Tensor:
-    """What the module's parameters multiply, written out: [n, d]."""
+    """The inputs that the module's parameters multiply, written out: [n, d]."""
     if isinstance(module, nn.Conv2d):
         k, s, p = module.kernel_size[0], module.stride[0], module.padding[0]
         x = F.pad(x, (p, p, p, p))
@@ -152,18 +152,18 @@ def rows_of(module: nn.Module, x: Tensor) -> Tensor:
 
 
 def dense_rows(module: nn.Module, x: Tensor) -> Tensor:
-    """What a linear map or convolution multiplies, with a 1 where it has a bias."""
+    """The inputs that a linear map or convolution multiplies, with a 1 if it has a bias."""
     rows = rows_of(module, x)
     return rows if module.bias is None else with_one(rows)
 
 
 def with_one(rows: Tensor) -> Tensor:
-    """Rows [n, d] and a 1, [n, d + 1]."""
+    """Rows [n, d] with a 1 appended, [n, d + 1]."""
     return torch.cat([rows, rows.new_ones(len(rows), 1)], 1)
 
 
 def measure(module: nn.Module, inputs: Inputs, energy: float = 1.0) -> dict[str, Spectrum]:
-    """What an anchor would hold of these inputs."""
+    """The spectra that an anchor would hold of these inputs."""
     if isinstance(module, nn.Embedding):
         own = Spectrum(
             (torch.bincount(inputs[0].flatten(), minlength=module.num_embeddings) > 0).double(),
@@ -216,7 +216,7 @@ def protected_share(
 
 @torch.no_grad()
 def share_of_displacement(now: nn.Module, then: Backbone, anchor: Anchor, energy: float) -> float:
-    """Share of what has moved between two models along what holds `energy` of the VQA inputs."""
+    """Share of the movement between two models along directions with `energy` of the VQA inputs."""
     start = {site: weights(then, site) for site in then.sites()}
     protections = nullspace.protections(
         anchor, {site: pair[0] for site, pair in start.items()}, Strength(energy)

@@ -1,4 +1,4 @@
-"""A stream of two tasks of robots that no simulator has, which a tiny VLM learns in a second."""
+"""A stream of two tasks of robots that have no simulator; a tiny VLM learns it in a second."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Done = Callable[[str], tuple[RecordedStreamReport, Path]]
 TASKS = ("pick", "open-drawer")
 JOINTS = {"pick": 3, "open-drawer": 2}  # two robots
 TEXTS = {"pick": "go to the red target", "open-drawer": "move the finger to the red target"}
-FRAMES = 9  # of those that are held out
+FRAMES = 9  # of the held-out episodes
 
 
 def robot(
@@ -35,10 +35,10 @@ def robot(
     actions: Sequence[str] | None = None,
     count: int = 6,
 ) -> Path:
-    """A dataset of a real robot's, whose actions are the positions to take.
+    """A dataset of a real robot, whose actions are target positions.
 
     Args:
-        scale: of all numbers.
+        scale: factor of all numbers.
         actions: their names; by default those of the positions.
     """
     rng = np.random.default_rng(len(task))
@@ -54,7 +54,7 @@ def robot(
 
 @pytest.fixture(scope="session")
 def paths(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """A dataset of each task; read only."""
+    """A dataset of each task; read-only."""
     folder = tmp_path_factory.mktemp("robots")
     return {task: robot(folder / task, task) for task in TASKS}
 
@@ -74,7 +74,7 @@ def real(make: Make, paths: dict[str, Path]) -> Make:
 
 @pytest.fixture(scope="session")
 def done(real: Make, tmp_path_factory: pytest.TempPathFactory) -> Done:
-    """A finished run of a learner; read only."""
+    """A finished run of a learner; read-only."""
     made: dict[str, tuple[RecordedStreamReport, Path]] = {}
 
     def get(method: str) -> tuple[RecordedStreamReport, Path]:
@@ -89,7 +89,7 @@ def done(real: Make, tmp_path_factory: pytest.TempPathFactory) -> Done:
 
 
 def assert_resumes(recipe: RobotStreamRecipe, folder: Path) -> None:
-    """A run that was interrupted in each task and resumed ends in the bytes of a whole one."""
+    """A run that is interrupted in each task and resumed ends with the bytes of a whole run."""
     train.run(recipe, folder / "whole")
     begin = partial(train.run, recipe, folder / "run")
     for _ in at_each(((f"task 1 {TASKS[0]}", 3), (f"task 2 {TASKS[1]}", 3)), begin):

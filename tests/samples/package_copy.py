@@ -1,4 +1,4 @@
-"""A copy of the package that a test may add to."""
+"""A copy of the package to which a test may add."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ _SOURCE = Path(aegis_cli.__file__).parent
 def copied(folder: Path) -> Path:
     """The package in `folder`, without the checkpoints that ship.
 
-    What is compiled of it holds for the copy, too, whose files are as old; one that another process
-    is only now writing may be gone before it is copied.
+    Its compiled files are valid for the copy too, since the source's times are copied. A compiled
+    file that another process is just writing may be gone before it is copied.
     """
     ignored = shutil.ignore_patterns("*.safetensors", "*.pyc.*")
     return shutil.copytree(_SOURCE, folder / "aegis_cli", ignore=ignored)
@@ -51,7 +51,7 @@ def declare_options(package: Path, source: str, kind: str, name: str) -> None:
 
 
 def run(package: Path, program: str, *arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    """What a program, given as Python or as a module's name, does where `aegis_cli` is the copy."""
+    """The result of a program (Python text or a module's name) with the copy as `aegis_cli`."""
     given = (str(package.parent), program, list(map(str, arguments)))
     return processes.alone(_ran, *given)
 
@@ -63,7 +63,7 @@ def _ran(folder: str, program: str, arguments: list[str]) -> subprocess.Complete
     os.chdir(folder)
     sys.argv = [program, *arguments]
     code = 0
-    # The command asks for the descriptors of its streams.
+    # The command needs real file descriptors for its streams.
     stream = partial(tempfile.TemporaryFile, "w+", encoding="utf-8")
     with stream() as out, stream() as err:
         with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):

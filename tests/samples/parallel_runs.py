@@ -1,4 +1,4 @@
-"""Trainings and whole jobs of several processes, which find these by their module."""
+"""Trainings and whole jobs with several processes, which find these by their module."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from samples import processes
 
 
 class Runnable(Protocol):
-    """What processes do together; it travels to them."""
+    """What processes do together; it is pickled and sent to them."""
 
     def run(self) -> None:
         """Do it here."""
@@ -41,8 +41,8 @@ class Job:
     """One training.
 
     Attributes:
-        killed_after: step after which its first process dies without a word.
-        resume: whether it goes on with what is there.
+        killed_after: step after which its first process is killed without a message.
+        resume: whether it resumes what is there.
     """
 
     recipe: Recipe
@@ -54,7 +54,7 @@ class Job:
     resume: bool = False
 
     def run(self) -> None:
-        """Train here, alone or with the processes that the environment speaks of."""
+        """Train here, alone or with the processes that the environment describes."""
 
         def die(event: Event) -> None:
             if not isinstance(event, Progress) or event.stage != "train":
@@ -75,10 +75,10 @@ class Job:
 
 @dataclass(frozen=True)
 class Averaging(Job):
-    """A training of a backbone that averages the pixels which it reads."""
+    """A training of a backbone that averages the pixels it reads."""
 
     def run(self) -> None:
-        """Train here, alone or with the processes that the environment speaks of."""
+        """Train here, alone or with the processes that the environment describes."""
         load = loading.backbones.load
 
         def averaging(name: str) -> Backbone:
@@ -104,7 +104,7 @@ class Planning:
     said: Path
 
     def run(self) -> None:
-        """Plan here, alone or with the processes that the environment speaks of."""
+        """Plan here, alone or with the processes that the environment describes."""
         job = self.job
         report = dry_run.run(job.recipe, job.method, job.demos, job.anchor, job.out)
         files.make_folder(self.said)
@@ -113,13 +113,13 @@ class Planning:
 
 @dataclass(frozen=True)
 class Measuring:
-    """An anchor, and a probe of the model that it is of."""
+    """An anchor, and a probe of the model on which it was measured."""
 
     model: Path
     out: Path
 
     def run(self) -> None:
-        """Measure here, alone or with the processes that the environment speaks of."""
+        """Measure here, alone or with the processes that the environment describes."""
         self.out.mkdir(exist_ok=True, parents=True)
         parts = ("moments", "inputs", "fisher", "curvature")
         settings = Anchor(samples=35, batch_size=4, parts=parts, fisher_samples=5)
@@ -195,7 +195,7 @@ class Piping:
     """All stages of a recipe.
 
     Attributes:
-        said: folder in which each process writes what it was told: the table, or what is wrong.
+        said: folder in which each process writes its result: the table or the error.
     """
 
     recipe: Recipe
@@ -203,7 +203,7 @@ class Piping:
     said: Path
 
     def run(self) -> None:
-        """Run it here, alone or with the processes that the environment speaks of."""
+        """Run it here, alone or with the processes that the environment describes."""
         events: list[str] = []
         try:
             report = pipeline.run(self.recipe, self.root, lambda event: events.append(event.stage))
@@ -227,7 +227,7 @@ class Failing:
     said: Path
 
     def run(self) -> None:
-        """Run it here, alone or with the processes that the environment speaks of."""
+        """Run it here, alone or with the processes that the environment describes."""
         printed = io.StringIO()
         with (
             pytest.MonkeyPatch.context() as patch,
@@ -250,7 +250,7 @@ class Leading:
     fails: str = ""
 
     def run(self) -> None:
-        """Do it here, alone or with the processes that the environment speaks of."""
+        """Do it here, alone or with the processes that the environment describes."""
         files.make_folder(self.out)
         try:
             told = leading.led(self._job)
@@ -268,13 +268,13 @@ class Leading:
         return f"{shared}"
 
     def note(self, what: str) -> None:
-        """Add a line to what this process did."""
+        """Add a line to this process's notes."""
         with (self.out / f"{launch.rank()}.txt").open("a") as notes:
             notes.write(what + "\n")
 
 
 def share(job: Leading, number: int, on_event: OnEvent, twice: bool) -> int:
-    """The sum of every process's number, which is larger by one in each."""
+    """The sum of every process's number, which is one larger in each."""
     with ranks.joined() as found:
         if job.fails == "within":
             raise Diverged("nothing finite", "numbers", "less", number)
@@ -285,7 +285,7 @@ def share(job: Leading, number: int, on_event: OnEvent, twice: bool) -> int:
 
 
 def run_together(count: int, jobs: Sequence[Runnable]) -> None:
-    """Let `count` processes do the jobs, one after the other, as torchrun would start them."""
+    """Let `count` processes do the jobs, one after the other, as if torchrun had started them."""
     processes.start(_run, (count, jobs, free_ports(len(jobs))), count)
 
 
@@ -306,7 +306,7 @@ def lose_one(rank: int, count: int, port: int) -> None:
 
 
 def _be_launched(rank: int, count: int, port: int) -> None:
-    """Set what torchrun tells a process."""
+    """Set the environment variables that torchrun sets for a process."""
     os.environ |= {
         "GLOO_SOCKET_IFNAME": "lo",
         "MASTER_ADDR": "127.0.0.1",
@@ -318,9 +318,9 @@ def _be_launched(rank: int, count: int, port: int) -> None:
 
 
 def free_ports(count: int) -> list[int]:
-    """Ports that nobody listens on, and that no connection is given by itself meanwhile.
+    """Ports that are free, and that the system does not give to connections in the meantime.
 
-    Those that systems give lie above 32,767.
+    The ports that systems assign are above 32,767.
     """
     found: list[int] = []
     while len(found) < count:

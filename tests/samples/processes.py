@@ -1,4 +1,4 @@
-"""Processes of a test that find torch, and what trains, imported; and worker processes that do."""
+"""Processes of a test that find torch and the training code already imported; worker processes."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from torch.multiprocessing import start_processes
 
 from aegis_cli.common import processes
 
-# Each of them would take four seconds to import this. The process that they are forked from does
-# so once; it has neither threads nor a graphics context.
+# Each process would take four seconds to import these. The process from which they are forked
+# imports them once; it has neither threads nor a graphics context.
 IMPORTED = (
     "pytest",
     "torch._dynamo",
@@ -35,7 +35,7 @@ Found = TypeVar("Found")
 
 
 def alone(function: Callable[..., Found], *args: Any) -> Found:
-    """What a function returns in a process of its own, which may do to torch what it likes.
+    """What a function returns in a process of its own, in which it may change torch as it likes.
 
     Raises:
         Exception: what the function raises.
@@ -46,10 +46,10 @@ def alone(function: Callable[..., Found], *args: Any) -> Found:
 
 @contextlib.contextmanager
 def aegis(args: Sequence[str], cwd: Path, said: Path) -> Iterator[BaseProcess]:
-    """`aegis ARGS`, started in a folder as by a terminal, in a group of its own; it ends at last.
+    """`aegis ARGS`, started in a folder as if by a terminal, in its own group; ended at the end.
 
     Args:
-        said: file that its stdout and its stderr go to; it is made.
+        said: file for its stdout and stderr, which is created.
     """
     said.touch()
     given = (_command, list(args), str(cwd), str(said))
@@ -66,7 +66,7 @@ def _command(args: Sequence[str], cwd: str, said: str) -> None:
     from aegis_cli.cli.app import main
 
     os.setsid()
-    # What a shell's background job or nohup ignores would be ignored here, too.
+    # A shell's background job or nohup ignores this signal, and so would this process.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     signal.signal(signal.SIGHUP, signal.SIG_DFL)
     written = os.open(said, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
@@ -78,32 +78,32 @@ def _command(args: Sequence[str], cwd: str, said: str) -> None:
 
 
 def _server() -> multiprocessing.context.BaseContext:
-    """What forks processes of the one that has everything imported."""
+    """The context whose processes are forked from one that has everything imported."""
     multiprocessing.set_forkserver_preload(list(IMPORTED))
     return multiprocessing.get_context("forkserver")
 
 
 def start(function: Callable[..., object], args: tuple[Any, ...], count: int) -> None:
-    """Let `count` processes call a function with their number and `args`; wait for their end.
+    """Let `count` processes call a function with their number and `args`; wait until they end.
 
     Raises:
         ProcessExitedException, ProcessRaisedException: one of them has failed; the others are
-            ended.
+            stopped.
     """
     _server()
     start_processes(partial(_begun, function), args, nprocs=count, start_method="forkserver")
 
 
 def _begun(function: Callable[..., Found], *args: Any) -> Found:
-    """Call the function; no collection of garbage looks through what was there before it."""
+    """Call the function; garbage collection skips the objects from before it."""
     gc.freeze()
     return function(*args)
 
 
 @pytest.fixture
 def quick_workers(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Worker processes that start at once, where a test looks at what they find alone."""
-    from aegis_cli.studies import cells  # which the fast tests have no need of
+    """Worker processes that start at once, for tests that only look at what they find."""
+    from aegis_cli.studies import cells  # which the fast tests do not need
 
     for module in (processes, cells):
         monkeypatch.setattr(module, "SPAWN", _server())

@@ -1,4 +1,4 @@
-"""What the processes of a distributed test run; each finds these by their module."""
+"""What the processes of a distributed test run; each process finds these by their module."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from aegis_cli.models import structure
 from samples.guard import IMAGE, LAYERS, Vlm, batch, make, task_loss, vector
 
 WORLD, STEPS = 2, 3
-PARTS = 2  # passes of a step, where it has several
+PARTS = 2  # passes per step, if it has several
 METHODS: dict[str, dict[str, Any]] = {
     "aegis": {"layers": LAYERS},
     "nullspace": {"vision": "vision", "energy": 0.9, "every": 2},
@@ -40,7 +40,7 @@ def begin(rank: int, folder: str) -> None:
 
 
 def train_together(rank: int, folder: str, paths: dict[str, Path]) -> None:
-    """What one of the processes runs: every method's guard, on whole and on sharded weights."""
+    """What each process runs: every method's guard, on whole and on sharded weights."""
     begin(rank, folder)
     with pytest.raises(AegisError, match="2 processes without process_group="):
         Guard(make(), paths["aegis"], LAYERS)
@@ -62,7 +62,7 @@ def train_together(rank: int, folder: str, paths: dict[str, Path]) -> None:
             for automatic in (False, True):
                 found = _trained_late(rank, name, paths[name], automatic)
                 torch.save(found, Path(folder) / f"{name}-late-{automatic}-{rank}.pt")
-    dist.barrier()  # neither leaves while the other may still talk to it
+    dist.barrier()  # neither leaves while the other may still communicate with it
     dist.destroy_process_group()
 
 
@@ -77,14 +77,14 @@ def _trained(
     """All weights after some steps, and the ledger.
 
     Args:
-        shares_states: whether each process keeps the optimizer's states of some parameters alone.
+        shares_states: whether each process keeps the optimizer states of only some parameters.
     """
     model, called = share(make())
     world = dist.group.WORLD
     guard = Guard(model, path, method=method, process_group=world, **METHODS[method])
     optimizer: torch.optim.Optimizer = torch.optim.AdamW(model.parameters(), lr=1e-2)
     if shares_states:
-        # Its import warns, which is an error outside of the processes that are started for this.
+        # Importing it warns, which is an error except in processes started for this.
         from torch.distributed.optim import ZeroRedundancyOptimizer
 
         optimizer = ZeroRedundancyOptimizer(model.parameters(), torch.optim.AdamW, lr=1e-2)
@@ -107,11 +107,11 @@ def _trained(
 
 
 def _trained_in_parts(rank: int, path: Path, sends_each: bool) -> tuple[Tensor, dict[str, Tensor]]:
-    """The same in a loop that calls nothing of the guard, a step's gradients in two passes.
+    """The same in a loop that calls nothing of the guard, with a step's gradients in two passes.
 
     Args:
-        sends_each: whether each of them sends what it has found, out of buckets that the gradients
-            lie in; else the first one sends nothing, as accelerate and Trainers have it.
+        sends_each: whether each pass communicates its gradients, which are views of the buckets;
+            otherwise the first pass communicates nothing, as in accelerate and the Trainers.
     """
     model = make()
     called = DistributedDataParallel(model, gradient_as_bucket_view=sends_each)
@@ -133,7 +133,7 @@ def _trained_in_parts(rank: int, path: Path, sends_each: bool) -> tuple[Tensor, 
 def _trained_late(
     rank: int, method: str, path: Path, automatic: bool
 ) -> tuple[Tensor, dict[str, Tensor]]:
-    """Steps over sharded weights in two passes, of which the last alone sums the gradients."""
+    """Steps over sharded weights in two passes, of which only the last reduces the gradients."""
     model, _ = _sharded(make())
     guard = Guard(model, path, method=method, process_group="world", **METHODS[method])
     optimizer = torch.optim.AdamW(model.parameters(), lr=1e-2)
@@ -188,12 +188,12 @@ def shard_under_a_guard(rank: int, folder: str, paths: dict[str, Path]) -> None:
             Guard(model, path, method=name, **options | {"process_group": dist.group.WORLD})
     with pytest.raises(AegisError, match="sharded by FSDP"):
         Guard.measure(model)
-    dist.barrier()  # neither leaves while the other may still talk to it
+    dist.barrier()  # neither leaves while the other may still communicate with it
     dist.destroy_process_group()
 
 
 class RmsNorm(nn.Module):
-    """As transformers' families have it, each in a class of its own."""
+    """As in transformers' families, which each have a class of their own for it."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -209,7 +209,7 @@ def know_sharded_norms(rank: int, folder: str) -> None:
     fully_shard(model)
     found = structure.find_maps(model, ()).kinds
     assert found == {"0": "maps", "1": "norms"}
-    dist.barrier()  # neither leaves while the other may still talk to it
+    dist.barrier()  # neither leaves while the other may still communicate with it
     dist.destroy_process_group()
 
 
@@ -228,5 +228,5 @@ def lack_one(rank: int, folder: str) -> None:
         2: None,
     }
     assert given[0] is not None and given[0].tolist() == [1.0 + rank] * 2
-    dist.barrier()  # neither leaves while the other may still talk to it
+    dist.barrier()  # neither leaves while the other may still communicate with it
     dist.destroy_process_group()

@@ -62,7 +62,7 @@ def _write_run(run: Path, method: str, number: int, family: str, changes: dict[s
 
 
 def _write_ledger(path: Path, method: str) -> None:
-    """Six steps, in which only `aegis` sheds something."""
+    """Six steps; only `aegis` removes part of the gradient."""
     steps = torch.arange(1, 7)
     anchored = method == "aegis"
     size = (len(steps), len(GROUPS))

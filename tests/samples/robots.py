@@ -44,7 +44,7 @@ def make(tiny_folder: Path, demos_file: Path, point_file: Path) -> Make:
             "method": method,
             "steps": STEPS,
             "batch_size": 4,
-            "chunk": 20,  # with as many executed: a rollout takes few predictions
+            "chunk": 20,  # all of them are executed, so a rollout needs few predictions
             "flow_samples": 2,
             "lr": 1e-2,
             "expert_lr": 3e-3,

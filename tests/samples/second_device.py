@@ -1,8 +1,8 @@
-"""A device besides the CPU, made of the CPU's own memory, and commands that run on it.
+"""A stand-in for a device besides the CPU, in the CPU's own memory, and commands that run on it.
 
-PyTorch offers one name for devices of others' making. Tensors of that device are wrappers here, and
-what they hold is computed by the CPU. As with a GPU, no operation takes tensors of both, and a
-number of it is read by waiting. A process that has such a device keeps it.
+PyTorch has one device name for third-party backends. Here, tensors of that device are wrappers, and
+the CPU computes on what they hold. As with a GPU, no operation takes tensors of both devices, and
+reading a number waits. A process that has made such a device keeps it.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from samples.command import command
 NAME = "stand_in"
 POSSIBLE = hasattr(registration, "_setup_privateuseone_for_python_backend")
 aten = torch.ops.aten
-# Operations that take tensors of both: copies, and the choice of rows by a CPU's list.
+# Operations that take tensors of both devices: copies, and indexing rows with a CPU tensor.
 INDEXING = {
     aten.index.Tensor,
     aten.index_put.default,
@@ -39,9 +39,9 @@ INDEXING = {
     aten._index_put_impl_.default,
 }
 MIXES = {aten._to_copy.default, aten.copy_.default, aten._pin_memory.default, *INDEXING}
-# Operations that take no number of the CPU's beside tensors of the device.
+# Operations that take no CPU scalars beside tensors of the device.
 STRICT = {aten.cat.default, aten.stack.default}
-# Those whose result, or its shape, depends on numbers that have to be read.
+# Operations whose result, or its shape, depends on numbers that have to be read.
 READS = {
     aten._local_scalar_dense.default,
     aten.nonzero.default,
@@ -51,13 +51,13 @@ READS = {
     aten.bincount.default,
 }
 waits: Counter[str] = Counter()
-# Models are loaded on the CPU, by threads of transformers' own.
+# transformers loads models on the CPU in its own threads.
 _loading = threading.Event()
-_sending = threading.local()  # `on`: what goes to the device now goes by itself
+_sending = threading.local()  # `on`: the copy to the device in progress does not wait
 
 
 class Mixed(RuntimeError):
-    """An operation takes tensors of both devices."""
+    """An operation has been given tensors of both devices."""
 
 
 class StandIn(Tensor):
@@ -98,7 +98,7 @@ class StandIn(Tensor):
 
 
 def _as_tensors(index: Any) -> Any:
-    """Lists of an index as tensors of the device; torch would make them out of a mode's sight."""
+    """Lists in an index as tensors of the device; torch would make them where no mode sees it."""
     if isinstance(index, tuple):
         return tuple(_as_tensors(one) for one in index)
     if isinstance(index, list | range):
@@ -112,10 +112,10 @@ def is_there(device: Any) -> bool:
 
 
 def compute(func: Any, args: Any, kwargs: Any) -> Any:
-    """One operation, by the CPU, on what the device's tensors hold.
+    """One operation, computed by the CPU on what the device's tensors hold.
 
     Raises:
-        Mixed: it takes tensors of both devices.
+        Mixed: it was given tensors of both devices.
     """
     tensors = _tensors(args, kwargs)
     of_device = [x for x in tensors if isinstance(x, StandIn)]
@@ -142,7 +142,7 @@ def compute(func: Any, args: Any, kwargs: Any) -> Any:
     def wrap(x: Any) -> Any:
         if not isinstance(x, Tensor):
             return x
-        # What an operation changes in place stays the tensor that it was.
+        # What an operation changes in place stays the same tensor.
         same = known.get(id(x))
         if same is not None:
             return same
@@ -154,10 +154,10 @@ def compute(func: Any, args: Any, kwargs: Any) -> Any:
 
 
 def _tensors(args: Any, kwargs: Any) -> list[Tensor]:
-    """The tensors that an operation takes, also those of lists.
+    """The tensors that an operation takes, including those in lists.
 
-    Operations have no deeper trees. PyTorch's own functions, which look for some, would take most
-    of the time of what runs on the device.
+    Operations have no deeper nesting. PyTorch's own tree functions, which look for it, would take
+    most of the time of what runs on the device.
     """
     found = []
     for x in (*args, *kwargs.values()):
@@ -169,14 +169,14 @@ def _tensors(args: Any, kwargs: Any) -> list[Tensor]:
 
 
 def _of_each(function: Callable[[Any], Any], x: Any) -> Any:
-    """A function of what an operation takes or gives; of each item where it is a list."""
+    """Apply a function to an operation's argument or result, or to each item of a list."""
     if isinstance(x, list | tuple):
         return type(x)([function(one) for one in x])
     return function(x)
 
 
 def _one_by_one(func: Any, args: Any, kwargs: Any) -> Any:
-    """An operation on lists of tensors, place by place: each place may be of another device."""
+    """An operation on lists of tensors, item by item, since items may be on different devices."""
     lists = [x for x in args if isinstance(x, list | tuple)]
     found = []
     for place in range(len(lists[0])):
@@ -187,11 +187,11 @@ def _one_by_one(func: Any, args: Any, kwargs: Any) -> Any:
 
 def _check(func: Any, args: Any, tensors: Sequence[Tensor]) -> None:
     if func in INDEXING:
-        tensors = [args[0], *args[2:3]]  # the places may be a CPU's
+        tensors = [args[0], *args[2:3]]  # the indices may be on the CPU
     elif func in MIXES:
         return
     for x in tensors:
-        # A number may be a CPU's.
+        # A scalar may be on the CPU.
         if not isinstance(x, StandIn) and (x.dim() > 0 or func in STRICT):
             shapes = [(tuple(one.shape), str(one.device)) for one in tensors]
             raise Mixed(f"{func} of {shapes}")
@@ -209,9 +209,9 @@ def _reads(func: Any, args: Any, kwargs: Any) -> bool:
 
 
 def note_wait() -> None:
-    """Count a wait within a step, by the place in Aegis, unless a model's own code waits."""
-    # The frames alone, from the innermost on: `extract_stack` would read their lines, too. Where
-    # to begin is told, since how many frames `walk_stack(None)` skips depends on Python's version.
+    """Count a wait within a step, by its place in Aegis, unless a model's own code waits."""
+    # Only the frames, from the innermost on, since `extract_stack` would also read their lines. The
+    # start is explicit, because what `walk_stack(None)` skips depends on Python's version.
     callers = [frame.f_code for frame, _ in traceback.walk_stack(sys._getframe())]
     if not any(code.co_filename.endswith("training/step.py") for code in callers):
         return
@@ -223,7 +223,7 @@ def note_wait() -> None:
 
 
 def note_copy() -> None:
-    """Count a copy to the device that waits, as it does unless `devices.send` makes it."""
+    """Count a copy to the device that waits, as all do except those by `devices.send`."""
     if not getattr(_sending, "on", False):
         note_wait()
 
@@ -240,7 +240,7 @@ def _sent_by_itself(send: Callable[..., Tensor]) -> Callable[..., Tensor]:
 
 
 class InReach(TorchDispatchMode):
-    """Within it tensors can be made on the device."""
+    """Lets tensors be made on the device within it."""
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = kwargs or {}
@@ -251,7 +251,7 @@ class InReach(TorchDispatchMode):
 
 
 class _Module(registration._DummyBackendModule if POSSIBLE else object):  # type: ignore[misc]
-    """What PyTorch asks of a device's module."""
+    """What PyTorch asks of a device module."""
 
     def get_amp_supported_dtype(self) -> list[torch.dtype]:
         return [torch.bfloat16]
@@ -268,17 +268,17 @@ class _Module(registration._DummyBackendModule if POSSIBLE else object):  # type
 
 @contextlib.contextmanager
 def in_reach(hugging_face: bool = False) -> Iterator[None]:
-    """Make the device, for the rest of the process, and let Aegis choose it within the block.
+    """Make the device for the rest of the process, and let Aegis choose it within the block.
 
     Args:
-        hugging_face: whether models of transformers are loaded, which takes long to import.
+        hugging_face: whether to patch transformers' loading too, whose import takes long.
     """
     registration._setup_privateuseone_for_python_backend(NAME, _Module())
     torch.__future__.set_swap_module_params_on_conversion(True)  # so that a parameter stays itself
     # Without a view of its own, a tensor of inference mode cannot be of a class of one's own.
     torch._C._InferenceMode = _without_gradients  # type: ignore[misc,assignment]
-    # PyTorch lists once what makes tensors, for blocks of `torch.device`. With the replacements in
-    # that list, transformers would not see that it lays out a model on the device `meta`.
+    # PyTorch lists the tensor constructors once, for blocks of `torch.device`. If the replacements
+    # were in that list, transformers would not see that it creates a model on the device `meta`.
     _device_constructors()
     makers = torch.tensor, torch.as_tensor
     torch.tensor, torch.as_tensor = map(_moved_after, makers)
@@ -295,12 +295,12 @@ def in_reach(hugging_face: bool = False) -> Iterator[None]:
 
 
 def _without_gradients(mode: bool) -> contextlib.AbstractContextManager[None]:
-    """What stands for inference mode, or for its end within it."""
+    """Replaces inference mode; a `mode` of False turns it off within it."""
     return torch.set_grad_enabled(not mode)
 
 
 def _moved_after(make: Callable[..., Tensor]) -> Callable[..., Tensor]:
-    """A maker of tensors from numbers, which torch would make out of a mode's sight."""
+    """A constructor of tensors from numbers; torch would make them where no mode sees it."""
 
     def made(data: Any, *args: Any, device: Any = None, **kwargs: Any) -> Tensor:
         if isinstance(data, StandIn):
@@ -325,7 +325,7 @@ def _let_threads_reach() -> None:
 
 
 def _load_outside(makers: Sequence[Callable[..., Tensor]]) -> None:
-    """Let transformers load and save on the CPU, as it would not for wrappers."""
+    """Let transformers load and save on the CPU, since its code does not work with wrappers."""
     from transformers import PreTrainedModel
 
     load, save = PreTrainedModel.from_pretrained.__func__, PreTrainedModel.save_pretrained
@@ -353,7 +353,7 @@ def _load_outside(makers: Sequence[Callable[..., Tensor]]) -> None:
 
 
 def said(commands: Sequence[Sequence[str]]) -> list[dict[str, Any]]:
-    """What each of the commands, run one after the other, said, and where its steps waited.
+    """The output of each command, run one after the other, and where its steps waited.
 
     Args:
         commands: each a list of `aegis`'s arguments.
@@ -372,11 +372,11 @@ def said(commands: Sequence[Sequence[str]]) -> list[dict[str, Any]]:
 def said_there(
     folder: Path, commands: Sequence[Sequence[str]], device: str, kind: str
 ) -> list[dict[str, Any]]:
-    """What `said` finds on a device, by commands in a folder.
+    """The result of `said` on a device, for commands in a folder.
 
     Args:
         device: the stand-in, which this process then keeps, or `cuda`.
-        kind: `hugging_face` where models of transformers are loaded.
+        kind: `hugging_face` if models of transformers are loaded.
     """
     os.environ[devices.VARIABLE] = "cuda" if device == "cuda" else "cpu"
     torch.set_num_threads(1)

@@ -1,4 +1,4 @@
-"""A policy server in a thread, and a client written from the protocol alone."""
+"""A policy server in a thread, and a client written only from the protocol."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ TEXT = "go to the red target"
 
 
 def deployed(policy: Any = None, cameras: tuple[str, ...] = (), seed: int = 0) -> DeployedPolicy:
-    """The tiny policy of three positions and two actions."""
+    """The tiny policy with three positions and two actions."""
     own = make_policy().eval() if policy is None else policy
     return DeployedPolicy(own, "reach", cameras, replan=2, seed=seed)
 
@@ -62,13 +62,13 @@ def served(
 
 
 class Client:
-    """What openpi's client sends and reads, with packing of its own."""
+    """What openpi's client sends and reads, with its own packing."""
 
     def __init__(self, url: str) -> None:
         self.url = url
 
     def say(self, message: str | bytes) -> Any:
-        """The answer to a raw message: a text for an error."""
+        """The answer to a raw message; an error is a text."""
         self.socket.send(message)
         answer = self.socket.recv(timeout=20)
         return answer if isinstance(answer, str) else unpack(answer)

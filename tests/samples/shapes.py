@@ -1,4 +1,4 @@
-"""Shapes of the true families that are small enough to train."""
+"""Shapes of the real families, small enough to train."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _TEXT = {
 
 
 def small(name: str) -> Shape:
-    """The shape of that name with every size small."""
+    """The shape of that name with every size reduced."""
     true = SHAPES[name]
     more, vision = dict(true.more), {**true.vision, **_TOWER}
     if true.family == "paligemma":

@@ -1,4 +1,4 @@
-"""Small recipes, a small trained run, and a small VLM that knows something it can lose."""
+"""Small recipes, a small trained run, and a small VLM that has knowledge to lose."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ TRAIN: dict[str, Any] = {
     "steps": 4,
     "batch_size": 4,
     "flow_samples": 2,
-    "chunk": 20,  # with as many executed: a rollout takes few predictions
+    "chunk": 20,  # all of them are executed, so a rollout needs few predictions
     "warmup": 1,
     "checkpoint_every": 2,
     "validate_every": 4,
@@ -55,14 +55,14 @@ def write(folder: Path, backbone: str | Path, **changes: Any) -> Path:
 def run_folder(
     tiny_folder: Path, demos_file: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> Path:
-    """A run of `naive` of two steps, the module's own."""
+    """A two-step run of `naive`, one per module."""
     folder = tmp_path_factory.mktemp("runs") / "naive"
     train.run(recipe(tiny_folder, steps=2), "naive", demos_file, None, folder)
     return folder
 
 
 def teach(model: EmbeddedVLM, asked: VQASet, steps: int = 120) -> EmbeddedVLM:
-    """Learn the answers to these very questions by heart."""
+    """Train the model until it knows the answers to these questions by heart."""
     images = torch.from_numpy(asked.images[asked.image_of])
     texts, answers = [q.text for q in asked.questions], [q.answer for q in asked.questions]
     optimizer = torch.optim.AdamW(model.parameters(), lr=3e-3)
@@ -74,5 +74,5 @@ def teach(model: EmbeddedVLM, asked: VQASet, steps: int = 120) -> EmbeddedVLM:
 
 
 def flipped(data: bytes) -> bytes:
-    """One bit is another."""
+    """The data with one bit flipped."""
     return data[:-1] + bytes([data[-1] ^ 1])

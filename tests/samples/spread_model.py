@@ -1,4 +1,4 @@
-"""A model whose layers lie on two devices, as `device_map="auto"` lays them; one is a stand-in."""
+"""A model with layers on two devices, as `device_map="auto"` places them; one is a stand-in."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from aegis_cli.guard.wide_step import WideStep
 from samples import second_device
 from samples.guard import LAYERS, Vlm, anchors_by_method, guarded_steps, make, measured
 
-PLACES = ("vision", "text.layers.0", "text.layers.1")  # what lies on the other device
-# What the guard does, by its method and options.
+PLACES = ("vision", "text.layers.0", "text.layers.1")  # what is on the other device
+# The guard's methods and options.
 GUARDS: dict[str, dict[str, object]] = {
     "aegis": {"method": "aegis", "layers": LAYERS},
     "aegis of the update": {"method": "aegis", "layers": LAYERS, "projects": "update"},
@@ -30,7 +30,7 @@ DONE = (*GUARDS, "measure", "masters")
 
 
 def spread(place: str | None) -> Vlm:
-    """The model with one part on the other device; None: with all on the CPU."""
+    """The model with one part on the other device; None: all of it is on the CPU."""
     model = make()
     if place is not None:
         model.get_submodule(place).to(second_device.NAME)
@@ -38,13 +38,13 @@ def spread(place: str | None) -> Vlm:
     model.vision.register_forward_hook(lambda _, given, found: found.to("cpu"))
     for layer in model.text.layers:
         layer.register_forward_pre_hook(_at_its_place)
-    # What a layer returns stays where the layer is, until somebody else needs it.
+    # A layer's output stays on the layer's device until something else needs it.
     model.around = lambda layer, *given: layer(*given).to("cpu")
     return model
 
 
 def _at_its_place(part: nn.Module, given: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
-    """What a part of the model is given, on the part's own device."""
+    """The inputs of a part of the model, on the part's own device."""
     place = next(part.parameters()).device
     return tuple(x.to(place) for x in given)
 
@@ -69,14 +69,14 @@ def _only_maps_learn(model: Vlm) -> None:
 
 
 def anchor(folder: Path, place: str | None) -> Tensor:
-    """What is measured of the model."""
+    """The measured anchor of the model."""
     path = measured(spread(place), folder / f"{place}.safetensors")
     tensors = load_file(path)
     return torch.cat([tensors[name].double().flatten() for name in sorted(tensors)])
 
 
 def masters(place: str | None) -> Tensor:
-    """Which parameters in half precision are their masters in float32 rounded: every other one."""
+    """Which half-precision parameters are their rounded float32 masters: every other one."""
     parameters = [p.detach().to(torch.bfloat16) for p in spread(place).parameters()]
     step = WideStep(torch.optim.AdamW(parameters), parameters)
     known = [p.float() + place % 2 for place, p in enumerate(parameters)]
@@ -84,7 +84,7 @@ def masters(place: str | None) -> Tensor:
 
 
 def moved(anchors: dict[str, Path]) -> str:
-    """What is said of a layer that goes to the other device once the guard is made."""
+    """The error about a layer that moves to the other device after the guard was made."""
     model = spread(None)
     guard = Guard(model, anchors["nullspace"], vision="vision", method="nullspace", energy=0.9)
     model.text.layers[1].to(second_device.NAME)
@@ -105,8 +105,8 @@ def _apart(made: Callable[[str | None], Tensor], whole: Tensor, place: str) -> f
 def apart(folder: Path) -> dict[str, dict[str, float | str]]:
     """How far the weights, or the anchor, are from those of the same model on the CPU alone.
 
-    They are by the layer that lies on the other device, which this process then keeps, and by what
-    was done. A text in the place of a number says what went wrong.
+    The keys are the layer on the other device, which this process then keeps, and what was done.
+    A text in place of a number says what went wrong.
     """
     torch.set_num_threads(1)
     found: dict[str, dict[str, float | str]] = {}

@@ -65,7 +65,7 @@ def study(folder: Path, **changes: Any) -> StreamStudyRecipe:
 
 
 def make(folder: Path, on_event: OnEvent) -> StreamRunner:
-    """A runner in a process that no fixture reaches."""
+    """A runner in a process where no fixture has any effect."""
     images.backbones.load_dual, images.streams.load = (
         stream_samples.load,
         stream_samples.load_stream,
@@ -75,7 +75,7 @@ def make(folder: Path, on_event: OnEvent) -> StreamRunner:
 
 
 def row(**figures: Any) -> StreamFigures:
-    """Figures of two tasks by hand; the inferred ones are the told ones unless they are given."""
+    """Figures of two tasks by hand; the inferred ones equal the told ones unless given."""
     plain: dict[str, Any] = {
         "method": "igsp",
         "transfer": 0.5,

@@ -96,7 +96,7 @@ class TinyDual(DualEncoder):
 
 
 def load(name: str) -> TinyDual:
-    """`tiny`, or a folder that `save` wrote."""
+    """`tiny`, or a model from a folder that `save` wrote."""
     model = TinyDual()
     if name != "tiny":
         if not (Path(name) / FILE).is_file():
@@ -105,11 +105,11 @@ def load(name: str) -> TinyDual:
     return model.eval()
 
 
-COUNTS, NOISE = (48, 12, 30), 0.4  # images of the parts
+COUNTS, NOISE = (48, 12, 30), 0.4  # images of the three parts
 
 
 def task(name: str, classes: int = 3, seed: int = 0) -> StreamTask:
-    """A random picture a class, under noise."""
+    """One random picture per class, with noise."""
     generator = torch.Generator().manual_seed(seed)
     pictures = torch.rand(classes, SIZE, SIZE, 3, generator=generator)
 
@@ -143,19 +143,19 @@ def edition(name: str) -> list[str]:
 
 @pytest.fixture
 def tiny_streams(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let stages find the encoder `tiny` and the streams above by name."""
+    """Let stages find the encoder `tiny` and the streams above by their names."""
     offer(monkeypatch)
 
 
 def offer(patch: pytest.MonkeyPatch) -> None:
-    """What `tiny_streams` does, as long as the patches last."""
+    """The same as `tiny_streams`, for as long as the patches last."""
     patch.setattr(images.backbones, "load_dual", load, raising=False)
     patch.setattr(images.streams, "load", load_stream, raising=False)
     patch.setattr(images.streams, "edition", edition)
 
 
 def recipe(method: str = "igsp", **changes: Any) -> StreamRecipe:
-    """A stream that is learned in a second; `changes` replace keys of `train`, or sections."""
+    """A stream that takes a second to learn; `changes` replace keys of `train`, or sections."""
     train = {
         "method": method,
         "steps": 12,

@@ -58,7 +58,7 @@ def write(folder: Path, keys: dict[str, Any]) -> Path:
 
 
 def study(folder: Path, backbone: str | Path, **changes: Any) -> StudyRecipe:
-    """The study as it is read from a file."""
+    """The study as read from a file."""
     loaded = study_cells.load(write(folder, raw(backbone, **changes)))
     assert isinstance(loaded, StudyRecipe)
     return loaded
@@ -92,22 +92,22 @@ def row(recipe: Recipe, **changes: Any) -> PolicyFigures:
 
 
 def unplayed(figures: PolicyFigures) -> PolicyFigures:
-    """The same of a policy that cannot be rolled out, whose error is less where it succeeds."""
+    """The same for a policy that cannot be rolled out; its error is less if it succeeds more."""
     error = 1.3 - figures.success_seen if figures.success_seen is not None else None
     acted = dict.fromkeys(("success_seen", "success_held_out", "wrong_target"))
     return replace(figures, **acted, open_loop_error=error, hold_error=0.75)
 
 
 def vqa_figures(**changes: Any) -> VqaFigures:
-    """Invented figures of a further set of questions."""
+    """Invented figures for a further set of questions."""
     made = VqaFigures(0.9, 5.0, (4.0, 6.0), 0.3, 2.0, 0.95, 0.2, 0.5)
     return replace(made, **changes)
 
 
 def invent(monkeypatch: pytest.MonkeyPatch, stop_after: int | None = None) -> list[str]:
-    """Invented rows instead of trainings; it returns the labels asked for.
+    """Invented rows instead of trainings; returns the labels of the calls.
 
-    The call after `stop_after` is a Ctrl-C.
+    The call after `stop_after` raises a Ctrl-C.
     """
     labels: list[str] = []
 
@@ -130,7 +130,7 @@ def invent(monkeypatch: pytest.MonkeyPatch, stop_after: int | None = None) -> li
 
 
 def fake_bench(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
-    """Costs without timing anything; returns the variants of each call."""
+    """Invented costs instead of timings; returns the variants of each call."""
     calls: list[list[str]] = []
 
     def compare(recipes: dict[str, Recipe], anchor: Path, on_event: Any = None) -> dict[str, Any]:
@@ -156,7 +156,7 @@ def found(
     The last variant has a knob, and some seeds of some variants diverged.
 
     Args:
-        by_error: whether nothing was rolled out, so that there are open-loop errors instead.
+        by_error: whether nothing was rolled out, so there are open-loop errors instead.
     """
     methods = {name: name if name in ("naive", "cotrain") else "lora" for name in names}
     rows = {

@@ -47,7 +47,7 @@ def images(count: int, seed: int = 0) -> Tensor:
 
 
 def robot_batch(size: int = 5, seed: int = 0) -> RobotBatch:
-    """Frames of which every third chunk runs past its episode."""
+    """Frames; every third chunk extends past its episode's end."""
     generator = torch.Generator().manual_seed(seed)
     is_pad = torch.zeros(size, CHUNK, dtype=torch.bool)
     is_pad[::3, -2:] = True
@@ -61,7 +61,7 @@ def robot_batch(size: int = 5, seed: int = 0) -> RobotBatch:
 
 
 def narrow_expert(backbone: Backbone) -> ActionExpert:
-    """An expert over a backbone, for three numbers of proprioception and two of action."""
+    """An action expert over a backbone, with three proprioceptive inputs and two actions."""
     shape = ExpertShape(
         depth=backbone.depth,
         heads=backbone.heads,
@@ -87,7 +87,7 @@ def make_policy(seed: int = 0) -> Policy:
 
 
 def policy_over(backbone: Backbone) -> Policy:
-    """A Hugging Face backbone under a narrow expert, with scales that change nothing."""
+    """A Hugging Face backbone under a narrow expert, with identity scales."""
     with torch.random.fork_rng():
         torch.manual_seed(0)
         expert = narrow_expert(backbone)
@@ -104,29 +104,29 @@ def double_policy(seed: int = 0) -> Policy:
 
 
 def double_batch(size: int = 4) -> Batch:
-    """What a backbone in float64 encodes; the texts differ in length."""
+    """Inputs for a float64 backbone; the texts differ in length."""
     prepared = make_tiny().prepare(images(size), [INSTRUCTIONS[i % 3] for i in range(size)])
     return Batch(prepared.pixels.double(), prepared.ids, prepared.mask)
 
 
 def make_moments(depth: int = 2, width: int = 32, seed: int = 0) -> list[Moments]:
-    """Gaussians that the tiny backbone's activations are not."""
+    """Gaussians that differ from the tiny backbone's activations."""
     generator = torch.Generator().manual_seed(seed)
     draw = [torch.randn(2, width, generator=generator, dtype=torch.float64) for _ in range(depth)]
     return [Moments(100, mean * 0.3, std.square() * 0.2 + 0.01) for mean, std in draw]
 
 
 def make_questions(count: int = 6) -> VQASet:
-    """Questions about noise, two an image."""
+    """Questions about noise, two per image."""
     asked = [Question("color", *ASKED[i % len(ASKED)]) for i in range(count)]
     return VQASet(images(count // 2, seed=5).numpy(), np.arange(count) // 2, tuple(asked))
 
 
 @cache
 def make_anchor(energy: float = 1.0) -> Anchor:
-    """Every part of an anchor of the tiny backbone.
+    """An anchor of the tiny backbone with all its parts.
 
-    Its moments are invented, its inputs and Fisher information measured.
+    Its moments are invented; its inputs and Fisher information are measured.
     """
     model, asked = make_tiny(), make_questions()
     return Anchor(
@@ -177,7 +177,7 @@ def start(method: Method, policy: Policy, anchor: Anchor | None = None, **change
 
 
 def adapt(method: Method, policy: Policy, anchor: Anchor | None = None, **changes: Any) -> Policy:
-    """The policy with the method at work on it; `gradients` finds its parts there."""
+    """The policy with the method started on it; `gradients` finds the parts there."""
     policy.parts = start(method, policy, anchor, **changes)  # type: ignore[assignment]
     return policy
 
@@ -185,10 +185,10 @@ def adapt(method: Method, policy: Policy, anchor: Anchor | None = None, **change
 def gradients(
     policy: Policy, method: Method, batch: RobotBatch | None = None, **options: Any
 ) -> step.StepGradients:
-    """One step's gradients in `.grad` of an adapted policy, always of the same noise and batch.
+    """Put one step's gradients into `.grad` of an adapted policy, with the same noise each time.
 
     Args:
-        batch: in place of the usual one.
+        batch: instead of the usual one.
     """
     policy.zero_grad()
     settings = {"index": 0, "flow_samples": 2, "precision": "float32"} | options

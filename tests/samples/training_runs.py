@@ -1,4 +1,4 @@
-"""Short trainings of the tiny backbone: fixtures that make them, and how two of them compare."""
+"""Short trainings of the tiny backbone: fixtures that make them, and how two are compared."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def start(recipe: Recipe, demos_file: Path, anchor_file: Path) -> Start:
 
 @pytest.fixture(scope="session")
 def whole_run(start: Start, tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
-    """A run of a method from first step to last, made once; read only."""
+    """A run of a method from the first step to the last, made once; read-only."""
 
     @cache
     def run(method: str) -> Path:
@@ -81,7 +81,7 @@ def whole_run(start: Start, tmp_path_factory: pytest.TempPathFactory) -> Callabl
 
 @pytest.fixture(params=sorted(METHODS))
 def finished(request: pytest.FixtureRequest, whole_run: Callable[[str], Path]) -> tuple[str, Path]:
-    """A method and a run of it from first step to last."""
+    """A method and a run of it from the first step to the last."""
     return request.param, whole_run(request.param)
 
 
@@ -91,7 +91,7 @@ def naive_run(whole_run: Callable[[str], Path]) -> Path:
 
 
 def contents(out: Path) -> dict[str, bytes | str]:
-    """Every file below a run folder but metrics.jsonl, whose times differ; links by target."""
+    """Every file of a run folder except metrics.jsonl, whose times differ; links by target."""
     paths = (p for p in sorted(out.rglob("*")) if p.is_symlink() or p.is_file())
     found = {
         str(p.relative_to(out)): str(p.readlink()) if p.is_symlink() else p.read_bytes()
@@ -108,7 +108,7 @@ def metrics(out: Path, without: frozenset[str] | set[str] = frozenset()) -> list
 def assert_same_run(one: Path, other: Path) -> None:
     a, b = contents(one), contents(other)
     assert a.keys() == b.keys()
-    # The file also says how its places are seen from the run, which lies elsewhere.
+    # The file also has relative paths from the run, whose place is different here.
     assert inputs.of(one) == inputs.of(other)
     for found in (a, b):
         found.pop(inputs.NAME, None)
@@ -117,7 +117,7 @@ def assert_same_run(one: Path, other: Path) -> None:
 
 
 def assert_resumes(start: Start, method: str, recipe: Recipe, folder: Path) -> None:
-    """A run that was interrupted and resumed is the uninterrupted one, byte for byte."""
+    """A run that is interrupted and resumed equals the uninterrupted one, byte for byte."""
     start(method, folder / "whole", recipe=recipe)
     with pytest.raises(KeyboardInterrupt):
         start(method, folder / "cut", recipe=recipe, on_event=stop_at(3, KeyboardInterrupt()))
@@ -134,7 +134,7 @@ def stop_at(done: int, error: BaseException) -> OnEvent:
 
 
 def small_policy(backbone: backbones.Backbone, demos: demonstrations.Demonstrations) -> Policy:
-    """A policy of the size that these trainings train, drawn from the global generator."""
+    """A policy of these trainings' size, drawn from the global generator."""
     proprio, actions = (demos.tensors[name].shape[1] for name in ("proprio", "actions"))
     shape = ExpertShape(
         backbone.depth,
@@ -149,10 +149,10 @@ def small_policy(backbone: backbones.Backbone, demos: demonstrations.Demonstrati
 
 
 def protected_shares(out: Path, anchor: Path, energy: float) -> list[float]:
-    """At each checkpoint of a run, the share of what has moved that VQA's inputs span.
+    """At each checkpoint of a run, the share of the movement inside the span of VQA's inputs.
 
     Args:
-        anchor: file with the inputs of the backbone that the run began with.
+        anchor: file with the inputs of the backbone with which the run began.
         energy: share of the inputs' energy that the directions hold.
     """
     origin = backbones.load(recipes.load(out / "recipe.yaml").backbone)

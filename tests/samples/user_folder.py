@@ -1,4 +1,4 @@
-"""A user's folder, and commands that have to be refused and leave it as it was."""
+"""A user's folder, and commands that must be refused and leave it as it was."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def place(
     anchor_file: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> Path:
-    """A working folder with everything a user has, and something that is no folder."""
+    """A working folder with everything a user has, and something that is not a folder."""
     folder = tmp_path / "place"
     folder.mkdir()
     write(folder, tiny_folder)
@@ -53,7 +53,7 @@ def place(
 def trained(
     tmp_path_factory: pytest.TempPathFactory, tiny_folder: Path, demos_file: Path, anchor_file: Path
 ) -> Path:
-    """A finished run; read only."""
+    """A finished run; read-only."""
     out = tmp_path_factory.mktemp("runs") / "x"
     train.run(recipe(tiny_folder), "aegis", demos_file, anchor_file, out)
     return out
@@ -68,7 +68,7 @@ def snapshot(folder: Path) -> dict[str, bytes | None]:
 
 @pytest.fixture
 def bad(aegis, place: Path) -> Callable[..., str]:
-    """Run a command that has to be refused and leave the folder as it was; returns the error."""
+    """Run a command that must be refused and leave the folder as it was; returns the error."""
 
     def call(*args: object, says: tuple[str, ...] = ()) -> str:
         before = snapshot(place)
@@ -109,5 +109,5 @@ def training(**changes: str) -> tuple[str, ...]:
 
 
 def leftovers(folder: Path) -> list[Path]:
-    """Temporary files and folders that somebody forgot."""
+    """Temporary files and folders that were left behind."""
     return [p for p in folder.rglob("*") if p.name.startswith(".") or p.name.endswith(".tmp")]

@@ -21,7 +21,7 @@ def picture(seed: int, width: int = 40, height: int = 30) -> Image.Image:
 
 
 def row(image: str, asked: int = 0, **changes: Any) -> dict[str, Any]:
-    """One line's content; a change to None takes the key away."""
+    """One line's content; a change to None removes the key."""
     text, answers = ASKED[asked]
     made = {"image": image, "question": text, "answers": answers, **changes}
     return {key: value for key, value in made.items() if value is not None}
@@ -42,7 +42,7 @@ def write_jsonl(
 
 
 def official_pair(images: int = 24) -> tuple[dict[str, Any], dict[str, Any]]:
-    """A questions file and its annotations as VQAv2 has them: ten answers each."""
+    """A questions file and its annotations in VQAv2's format: ten answers each."""
     questions, annotations = [], []
     for i in range(images):
         for n, (text, answers) in enumerate(ASKED):
@@ -87,7 +87,7 @@ def write_official(
 ) -> Path:
     """The files under their official names; returns the questions file.
 
-    The images lie as COCO's archive unpacks them, or beside.
+    The images are placed as in COCO's archive, or beside the files.
     """
     questions, annotations = official_pair(images)
     place = folder / "val2014" if own_folder else folder
@@ -103,7 +103,7 @@ def write_official(
 
 
 def hub_rows(images: int = 24, **columns: Any) -> dict[str, list[Any]]:
-    """The columns of a data set, two rows an image; a change to None takes the column away."""
+    """The columns of a data set, two rows per image; a change to None removes the column."""
     count = images * len(ASKED)
     made = {
         "image": [picture(i // len(ASKED), 30 + i // len(ASKED)) for i in range(count)],

@@ -31,7 +31,7 @@ FORMS = {
 
 @pytest.fixture(scope="session")
 def scenes() -> list[tuple[Scene, list[Question]]]:
-    """Scenes, each with every family's questions in the shares of pre-training."""
+    """Scenes, each with questions of every family in the proportions of pre-training."""
     renderer, balancer, made = SceneRenderer(), Balancer(), []
     for index in range(SCENES):
         rng = scene_rng(0, "train", index)
@@ -55,7 +55,7 @@ def cell_of(thing: Thing) -> str:
 
 
 def called(name: str, things: tuple[Thing, ...]) -> list[Thing]:
-    """The things that a noun phrase may mean: 'red cubes', 'blue pad', 'object at x3 y5'."""
+    """The things to which a noun phrase may refer: 'red cubes', 'blue pad', 'object at x3 y5'."""
     name, _, cell = name.partition(" at ")
     words = [word if word in COLORS else word.removesuffix("s") for word in name.split()]
     assert words and all(w in COLORS or w in SHAPES or re.fullmatch(NOUNS, w) for w in words), name
@@ -70,9 +70,9 @@ def only(name: str, things: tuple[Thing, ...]) -> Thing:
 
 
 def truth(question: Question, things: tuple[Thing, ...]) -> str:
-    """What the question's words ask of these things.
+    """The answer to the question's words for these things.
 
-    It fails if a name does not mean exactly one of them.
+    It fails if a name does not refer to exactly one of them.
     """
     match = re.fullmatch(FORMS[question.family], question.text)
     assert match, question

@@ -1,4 +1,4 @@
-"""What worker processes of tests do; a spawned process finds these by their module."""
+"""What the worker processes of tests do; a spawned process finds these by their module."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from aegis_cli.common.processes import WorkerPool
 
 
 def keep_while_at_work(path: Path) -> None:
-    """Keep a file, with this process's number in it, as long as the work lasts: very long."""
+    """Keep a file with this process's number in it during the work, which takes very long."""
     try:
         path.write_text(str(os.getpid()), encoding="utf-8")
         time.sleep(600)
@@ -23,24 +23,24 @@ def keep_while_at_work(path: Path) -> None:
 
 
 def hold(folder: Path) -> None:
-    """Hold the folder's lock until this process is ended, and say so on stdout."""
+    """Hold the folder's lock until this process is killed, and say so on stdout."""
     with locks.alone(folder):
         print("held", flush=True)
         time.sleep(600)
 
 
 def employ(path: Path) -> None:
-    """Have a worker process at work."""
+    """Start a worker process and keep it at work."""
     with WorkerPool(1, "a test's process", "") as pool:
         pool.submit(keep_while_at_work, path).result()
 
 
 def peaks() -> tuple[int, int, int, int]:
-    """A size in bytes, and what the process has had at most.
+    """A size in bytes, and three peaks of the process's memory.
 
-    With so much more, from when that was given back, and with half of it once more.
+    The peaks: after allocating that size, since it was freed, and with half of it allocated again.
     """
-    import torch  # which the other processes have no need of
+    import torch  # which the other processes do not need
 
     from aegis_cli.common import memory
 
@@ -56,7 +56,7 @@ def peaks() -> tuple[int, int, int, int]:
 
 
 class _Allocated(ctypes.Structure):
-    """What glibc's `mallinfo2` returns; `hblkhd` are the bytes of blocks mapped by themselves."""
+    """What glibc's `mallinfo2` returns; `hblkhd` is the size of the blocks mapped separately."""
 
     _fields_ = [
         *((name, ctypes.c_size_t) for name in ("arena", "ordblks", "smblks", "hblks")),
@@ -66,9 +66,9 @@ class _Allocated(ctypes.Structure):
 
 
 def mapped_blocks() -> tuple[int, int, int]:
-    """How many more bytes are mapped by themselves while a process has a tensor of 24 MB.
+    """How many more bytes are mapped separately while a process has a tensor of 24 MB.
 
-    Before `memory.returned`, within it, and after it.
+    The values are from before `memory.returned`, within it, and after it.
     """
     import torch
 
@@ -79,12 +79,12 @@ def mapped_blocks() -> tuple[int, int, int]:
 
     def of_a_tensor() -> int:
         before = tell().hblkhd
-        tensor = torch.empty(24_000_000, dtype=torch.uint8)  # larger than any hole
+        tensor = torch.empty(24_000_000, dtype=torch.uint8)  # larger than any gap
         more = tell().hblkhd - before
         assert len(tensor)
         return more
 
-    for _ in range(2):  # a large block that is freed raises the limit
+    for _ in range(2):  # freeing a large block raises the limit
         torch.empty(30_000_000, dtype=torch.uint8)
     before = of_a_tensor()
     with memory.returned():
@@ -93,7 +93,7 @@ def mapped_blocks() -> tuple[int, int, int]:
 
 
 def faults_after_returned() -> tuple[int, int]:
-    """Page faults of ten blocks of 20 MB, after `memory.returned`, and how many pages they have."""
+    """Page faults of ten blocks of 20 MB after `memory.returned`, and their number of pages."""
     import torch
 
     from aegis_cli.common import memory
@@ -106,7 +106,7 @@ def faults_after_returned() -> tuple[int, int]:
 
     with memory.returned():
         pass
-    for _ in range(10):  # the first ones find their place
+    for _ in range(10):  # the first ones have to get their memory
         fill()
     before = faults()
     for _ in range(10):

@@ -1,4 +1,4 @@
-"""The latency is that of single predictions, after the first ones. No figure is asserted."""
+"""The latency is that of single predictions, after the first ones. No value is asserted."""
 
 from __future__ import annotations
 

@@ -38,7 +38,7 @@ def test_several_cameras_have_keys_of_their_own() -> None:
 
 @pytest.mark.parametrize("key", ["observation/image", "observation/wrist"])
 def test_the_picture_of_a_single_camera_has_two_names(key: str) -> None:
-    """That of every policy with one camera, which clients know, and its own."""
+    """The one for every policy with one camera, which clients know, and its own."""
     seen = observation()
     picture = seen.pop("observation/image")
     found = Reader(deployed(cameras=("observation.images.wrist",))).read(seen | {key: picture})
@@ -52,7 +52,7 @@ def test_a_datasets_own_name_of_a_picture_is_openpis() -> None:
 
 @pytest.mark.parametrize("first", ["observation/image", "observation/wrist"])
 def test_the_only_cameras_own_key_goes_before_the_one_of_every_policy(first: str) -> None:
-    """A robot of two cameras sends its scene as `observation/image`, too."""
+    """A robot with two cameras sends its scene as `observation/image`, too."""
     seen = observation()
     scene, wrist = seen.pop("observation/image"), np.full((64, 64, 3), 7, np.uint8)
     both = {"observation/image": scene, "observation/wrist": wrist}
@@ -83,7 +83,7 @@ def test_a_missing_key_is_named_with_those_that_are_there(missing: str) -> None:
 
 @pytest.mark.parametrize("blank", ["", "  ", None])
 def test_a_blank_prompt_is_none(blank: str | None) -> None:
-    """The server's own stands in for it, where there is one."""
+    """The server's own prompt is used instead, if there is one."""
     policy = DeployedPolicy(make_policy().eval(), None, CAMERAS, 2, recorded=MOTORS)
     for seen in (several(), LEROBOTS | {"task": ""}, ROBOTS):
         assert Reader(policy, "hold").read(seen | {"prompt": blank}).prompt == "hold"
@@ -99,7 +99,7 @@ def test_the_error_of_a_missing_key_names_what_was_sent() -> None:
 
 
 def test_a_frame_of_features_that_the_policy_names_is_read() -> None:
-    """As of LIBERO's datasets, whose names do not begin as LeRobot's do."""
+    """For example LIBERO's datasets, whose names do not begin like LeRobot's."""
     cameras = ("image", "wrist_image")
     recorded = {"state": ["state"]}
     policy = DeployedPolicy(make_policy().eval(), None, cameras, 2, recorded=recorded)
@@ -140,7 +140,7 @@ def test_lerobots_observations_and_a_robots_are_read_as_openpis(
     assert (found.prompt, found.state.tolist()) == (TEXT, [1, 2, 3])
     assert found.state.dtype == np.float32
     assert Reader(policy, "hold").read(seen).prompt == "hold"
-    # So is that of a robot that goes on meanwhile.
+    # So is the observation of a robot that keeps moving meanwhile.
     left = {"previous_actions": np.ones((3, 2)), "delay": 2}
     moving = Reader(policy).read(seen | text | left)
     assert (moving.delay, moving.previous.tolist()) == (2, [[1, 1]] * 3)

@@ -1,4 +1,4 @@
-"""A robot that never waits: its actions are those that were predicted for the step it is in."""
+"""A robot that never waits: its actions are those that were predicted for its current step."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ def deployed(replan: int = 2, ensemble: float | None = None) -> DeployedPolicy:
 
 
 def at(step: int) -> list[float]:
-    """Positions that say in which step the robot is."""
+    """Positions that encode the robot's current step."""
     return [float(step), 0.0, 0.0]
 
 
 class Planned(DeployedPolicy):
-    """A policy whose every action is the number of the step that it is meant for.
+    """A policy whose every action is the number of the step for which it is meant.
 
-    All predictions but the first of an instruction wait until they may end.
+    All predictions except the first of an instruction wait until they may end.
     """
 
     def __init__(self, replan: int = 2) -> None:
@@ -61,11 +61,11 @@ class Planned(DeployedPolicy):
 def planned() -> Iterator[Planned]:
     policy = Planned()
     yield policy
-    policy.may_end.release(100)  # a test that failed leaves no thread behind
+    policy.may_end.release(100)  # a failed test leaves no thread behind
 
 
 def finished(running: RealTime) -> None:
-    """Let the prediction that is under way end, and wait until it has."""
+    """Let the pending prediction end, and wait until it has."""
     running._policy.may_end.release()
     futures.wait([running._pending])
 
@@ -83,8 +83,8 @@ def test_each_action_is_one_for_its_own_step_whatever_predictions_take(
                 finished(running)
             action = running.select_action(picture, TEXT, at(step))
             assert action.tolist() == [step, step]
-            if running._pending is not None and running._since == 1:  # it has just begun
-                taken.append(int(rng.integers(1, 3)))  # as long as the chunk before lasts, at most
+            if running._pending is not None and running._since == 1:  # it has just started
+                taken.append(int(rng.integers(1, 3)))  # at most as long as the previous chunk lasts
                 ends = step + taken[-1]
         assert running.waited == 0 and running.delay == max(taken[-11:-1])
         planned.may_end.release(10)
@@ -121,7 +121,7 @@ def test_the_longest_of_the_last_delays_is_expected(planned: Planned) -> None:
 def test_a_slow_first_prediction_is_expected_once_and_shifts_no_action(
     planned: Planned, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As a GPU's, which prepares in it. The robot stands still meanwhile, so nothing is skipped."""
+    """As on a GPU, which initializes during it. The robot stands still, so nothing is skipped."""
     picture, times = images(1)[0].numpy(), iter([0.0, 0.65])
     monkeypatch.setattr(real_time, "time", SimpleNamespace(perf_counter=times.__next__))
     planned.fps = 10
@@ -130,8 +130,8 @@ def test_a_slow_first_prediction_is_expected_once_and_shifts_no_action(
             if step == 3:
                 finished(running)
             assert running.select_action(picture, TEXT, at(step)).tolist() == [step, step]
-            assert running.delay == (7 if step < 3 else 1)  # 6.5 steps, and then what it took
-        # Held to all that is left of the chunk, and to no more.
+            assert running.delay == (7 if step < 3 else 1)  # 6.5 steps, then the measured time
+        # The chunk is held to all that is left of the previous one, and to no more.
         assert [c and (c.delay, c.actions.shape[1]) for _, c in planned.asked] == [None, (2, 2)]
         planned.may_end.release(10)
 
@@ -142,7 +142,7 @@ def test_a_robot_that_has_nothing_left_to_do_waits_and_goes_on(planned: Planned)
         for step in range(4):
             running.select_action(picture, TEXT, at(step))
         threading.Timer(0.05, planned.may_end.release).start()
-        # Asked for in step 2, it has an action for step 4.
+        # Requested in step 2, it has an action for step 4.
         assert running.select_action(picture, TEXT, at(4)).tolist() == [4, 4]
         assert running.waited == 1 and running.delay == 2
         planned.may_end.release(10)
@@ -193,7 +193,7 @@ def test_another_instruction_begins_anew(planned: Planned) -> None:
     with RealTime(planned, guided=True) as running:
         for step in range(3):
             running.select_action(picture, TEXT, at(step))
-        # What is under way is of the old instruction.
+        # The pending prediction is for the old instruction.
         threading.Timer(0.05, planned.may_end.release).start()
         assert running.select_action(picture, OTHER, at(50)).tolist() == [50, 50]
         assert [c is None for _, c in planned.asked] == [True, False, True]
@@ -228,7 +228,7 @@ def test_an_episode_begins_as_that_of_the_policy_does() -> None:
 
 
 def test_chunks_of_a_real_policy_continue_each_other(run_folder: Path) -> None:
-    """Its own thread differentiates it, within a program that differentiates nothing."""
+    """Its own thread computes gradients, within a program that computes none."""
     picture = images(1)[0].numpy()
     with torch.inference_mode(), RealTime(load_policy(run_folder), guided=True) as running:
         positions = [0.1] * running._policy.positions

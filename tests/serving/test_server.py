@@ -1,4 +1,4 @@
-"""Clients of the policy server get the policy's own actions, and a clear word where they err."""
+"""Clients of the policy server get the policy's own actions, and a clear error if they err."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from aegis_cli.serving.server import Serving, listen
 
 
 def chunk(policy: Any, seen: dict[str, Any]) -> np.ndarray:
-    """What the policy predicts without a server."""
+    """The policy's prediction without a server."""
     arguments = (seen["observation/image"], seen["prompt"], seen["observation/state"])
     return policy.predict_action_chunk(*arguments)
 
@@ -79,7 +79,7 @@ def test_every_connection_is_an_episode_of_its_own() -> None:
             first = one.infer(seen)["actions"]
             second = one.infer(seen)["actions"]
             np.testing.assert_array_equal(other.infer(seen)["actions"], first)
-            assert not np.array_equal(first, second)  # the noise goes on
+            assert not np.array_equal(first, second)  # the noise continues
         with Client(serving.url) as third:
             np.testing.assert_array_equal(third.infer(seen)["actions"], first)
 
@@ -188,7 +188,7 @@ def test_an_observation_that_does_not_fit_says_why(
 def test_the_server_tells_who_comes_what_is_refused_and_who_goes() -> None:
     told: list[str] = []
     with served(deployed(), tell=told.append) as serving, Client(serving.url) as client:
-        for _ in range(3):  # a robot that goes on asking
+        for _ in range(3):  # a robot that keeps asking
             client.infer(observation(prompt=""))
         client.infer(observation())
         client.infer(observation(prompt=""))
@@ -295,7 +295,7 @@ def test_the_policy_acts_in_the_precision_that_was_asked_for(
 
 
 def test_a_temporal_ensemble_answers_with_the_one_action_of_a_step() -> None:
-    """Each connection has its own; a client that executes whole chunks executes that one."""
+    """Each connection has its own; a client that executes whole chunks executes this one."""
     decay = 0.1
     own, given = (
         DeployedPolicy(make_policy().eval(), "reach", (), replan=2, ensemble=decay)

@@ -1,4 +1,4 @@
-"""Messages are openpi's, in both directions, and arrays survive them."""
+"""Messages in both directions are openpi's, and arrays survive them unchanged."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from aegis_cli.serving import wire
 
 ARRAYS = [
     np.arange(6, dtype=np.float32).reshape(2, 3),
-    np.arange(6, dtype=np.int64).reshape(2, 3).T,  # its numbers do not lie in order
+    np.arange(6, dtype=np.int64).reshape(2, 3).T,  # its numbers are not contiguous
     np.zeros((0, 4), np.uint8),
     np.array(3.5),
     np.array([True, False]),

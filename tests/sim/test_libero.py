@@ -1,4 +1,4 @@
-"""LIBERO's tasks as its own users see them; needs LIBERO and its meshes."""
+"""LIBERO's tasks as LIBERO itself shows them; needs LIBERO and its meshes."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def test_an_episode_follows_from_its_numbers_alone() -> None:
     env, before = made("libero/goal", 2, published=True), np.random.get_state()[1].copy()
     first = begun(env, 2)
     assert same(first, begun(made("libero/goal", 2, published=True), 2))
-    assert np.array_equal(before, np.random.get_state()[1])  # others draw from it, too
+    assert np.array_equal(before, np.random.get_state()[1])  # others draw from it too
     assert first.image.shape == first.more[0].shape == (256, 256, 3)
     assert first.proprio.shape == (8,) and first.proprio.dtype == np.float32
 
@@ -76,7 +76,7 @@ def test_published_episodes_are_others_than_those_of_a_validation() -> None:
 
 
 def test_published_episodes_begin_in_liberos_states() -> None:
-    """The tasks take turns, and each goes through its states in their order."""
+    """The tasks take turns, and each goes through its states in order."""
     from aegis_cli.sim.libero import _states
 
     states, turns = _states("object", 3), {3: 0, 13: 1, 503: 0}
@@ -135,7 +135,7 @@ def test_a_home_that_it_cannot_write_to_is_named(tmp_path: Path) -> None:
 
 
 def test_a_signal_ends_the_placing_of_objects(monkeypatch: pytest.MonkeyPatch) -> None:
-    """LIBERO's own `reset` would begin again, whatever has ended it."""
+    """LIBERO's own `reset` would start again, whatever has ended it."""
     from aegis_cli.sim import libero
 
     def interrupted(*_: object) -> None:
@@ -175,7 +175,7 @@ def test_what_is_not_looked_at_changes_nothing() -> None:
 
 
 def test_one_that_ends_leaves_anothers_pictures() -> None:
-    """Each has an OpenGL context, of which one is the current."""
+    """Each has an OpenGL context, one of which is current."""
     alone, other, ends = (made("libero/spatial", n, published=True) for n in (1, 1, 0))
     begun(alone, 1), begun(other, 1)
     begun(ends, 0)
@@ -201,7 +201,7 @@ def test_a_process_that_draws_other_things_too_ends_quietly() -> None:
 
 
 def test_folders_of_another_installation_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    """LIBERO keeps in the home folder where its files are, whichever environment it is in."""
+    """LIBERO stores the paths of its files in the home folder, for all environments."""
     from aegis_cli.sim import libero
 
     monkeypatch.setattr(libero, "get_libero_path", lambda kind: f"/gone/{kind}")
@@ -222,7 +222,7 @@ def test_it_ends_after_its_suites_steps_and_closes_its_simulator() -> None:
 
 @pytest.mark.parametrize(("suite", "number"), [("object", 3), ("goal", 2), ("spatial", 1)])
 def test_it_is_the_environment_of_lerobot(suite: str, number: int) -> None:
-    """To the pixel, and in positions but for rounding, as its processor makes of them."""
+    """Pictures are equal to the pixel, and positions up to rounding, after its processor."""
     envs = pytest.importorskip("lerobot.envs.libero")
     processor = pytest.importorskip("lerobot.processor.env_processor").LiberoProcessorStep()
     import torch
@@ -259,7 +259,7 @@ def test_it_is_the_environment_of_lerobot(suite: str, number: int) -> None:
 
 
 def test_it_ends_in_success_when_liberos_goal_is_reached() -> None:
-    """The soup is let fall into the basket."""
+    """The soup is dropped into the basket."""
     env = made("libero/object", published=True)
     begun(env, 0)
     assert not env.step(np.zeros(7), look=False).done

@@ -1,4 +1,4 @@
-"""LIBERO's tasks and suites by name, and what is refused; needs no LIBERO."""
+"""LIBERO's tasks and suites by name, and what is refused; does not need LIBERO."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from aegis_cli.sim import libero_table as table
 from aegis_cli.sim.libero_table import CAMERAS
 
 SUITES = ("spatial", "object", "goal", "10", "90")
-# What LeRobot allows an episode of each suite: `TASK_SUITE_MAX_STEPS` of lerobot.envs.libero.
+# The steps that LeRobot allows per suite: `TASK_SUITE_MAX_STEPS` of lerobot.envs.libero.
 LEROBOT_STEPS = {"spatial": 280, "object": 280, "goal": 300, "10": 520, "90": 400}
 
 
@@ -31,7 +31,7 @@ def test_every_suite_has_its_tasks_by_their_numbers() -> None:
 
 
 def test_every_task_has_an_instruction_that_leads_back_to_it() -> None:
-    """Alone, but for a few that scenes of libero/90 share with each other and with two suites."""
+    """To it alone, except for a few that libero/90's scenes share with each other or two suites."""
     for suite in SUITES:
         tasks = sim.members(f"libero/{suite}")
         texts = table.instructions(f"libero/{suite}")
@@ -48,7 +48,7 @@ def test_all_is_the_four_suites_that_papers_report() -> None:
     assert list(sim.members("libero/all")) == of_suites and len(of_suites) == 40
     assert [suite.removeprefix("libero/") for suite in sim.suites("libero/all")] == [*SUITES[:-1]]
     assert not any(map(sim.suites, ("libero/goal", "libero/10-3", "metaworld/mt10", "reach")))
-    assert table.spec("libero/all").max_steps == 520  # an episode of the longest
+    assert table.spec("libero/all").max_steps == 520  # the longest suite's
     assert [sim.member("libero/all", n) for n in (0, 39, 40)] == [
         "libero/spatial-0",
         "libero/10-9",
@@ -93,7 +93,7 @@ def test_libero_alone_is_learned_from_data_sets() -> None:
 
 
 def test_it_cannot_be_recorded(aegis, tmp_path: Path) -> None:
-    """Wherever demonstrations would be; whether LIBERO is there or not."""
+    """Wherever demonstrations can be recorded, and whether or not LIBERO is installed."""
     out = tmp_path / "d.safetensors"
     asked = "HuggingFaceVLA/libero"
     assert asked in refused(aegis("demos", "libero/object", "--out", out))

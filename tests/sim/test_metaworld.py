@@ -1,4 +1,4 @@
-"""MetaWorld's tasks: names, steps, goals and successes as the benchmark has them, and learning."""
+"""MetaWorld's tasks: the benchmark's names, steps, goals and successes, and learning."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def start(name: str, i: int = 0) -> TaskEnv:
 
 
 def finish(env: TaskEnv) -> tuple[Step, int]:
-    """The expert's last step, and how many it took; nobody looks."""
+    """The expert's last step, and the number of steps; nothing is rendered."""
     count = 0
     while True:
         step = env.step(env.expert_action(), look=False)
@@ -89,7 +89,7 @@ def test_goals_follow_from_the_episode_alone() -> None:
 
 
 def test_the_first_observation_shows_this_episodes_objects() -> None:
-    """The benchmark itself reports them where they were before."""
+    """The benchmark itself reports their earlier positions."""
     places, told = [], []
     for i in range(2):
         env = start("metaworld/drawer-open", i)
@@ -100,7 +100,7 @@ def test_the_first_observation_shows_this_episodes_objects() -> None:
 
 
 def test_the_hand_is_welded_as_the_benchmark_says() -> None:
-    """Whatever number of numbers MuJoCo has for it."""
+    """This holds however many numbers MuJoCo has for it."""
     model = sim.make("metaworld/reach")._env.model
     row = model.eq_data[model.eq_type == mujoco.mjtEq.mjEQ_WELD][0]
     assert row[:11].tolist() == [0, 0, 0, 0, 0, 0, -1, 0, 0, 0, 5] and not row[11:].any()
@@ -121,7 +121,7 @@ def test_the_picture_is_upright_and_shows_the_hand() -> None:
         for _ in range(20):
             step = env.step(np.array([0.0, 0.0, dz, 0.0]))
         up = env._env.data.camera(table.CAMERA).xmat.reshape(3, 3)[:, 1]
-        assert up[2] < 0  # so the picture is turned
+        assert up[2] < 0  # so the picture is rotated
         rows.append(step.observation)
     assert rows[0].proprio[2] > rows[1].proprio[2]
     assert np.abs(rows[0].image.astype(int) - rows[1].image).max() > 50
@@ -150,7 +150,7 @@ def test_random_actions_do_not_succeed() -> None:
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, record.DemosReport]:
-    """Demonstrations of the set, by one process; read only."""
+    """Demonstrations of the set, by one process; read-only."""
     path = tmp_path_factory.mktemp("set") / "demos.safetensors"
     return path, record.run(SET, 5, 0, path, workers=1)
 
@@ -159,7 +159,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, record.Dem
 def test_demonstrations_of_a_set_are_the_same_by_any_number_of_processes(
     recorded: tuple[Path, record.DemosReport], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of these few episodes each process takes one at a time: fewer are begun in vain."""
+    """With this few episodes, each process takes one at a time, so fewer are started in vain."""
     path, report = recorded
     monkeypatch.setattr(keeping, "mapped", lambda *given, chunk: processes.mapped(*given, chunk=1))
     assert record.run(SET, 5, 0, tmp_path / "two", workers=2).sha256 == report.sha256
@@ -188,7 +188,7 @@ def test_a_lerobot_dataset_knows_its_set(tmp_path: Path) -> None:
 
 @pytest.fixture
 def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder to work in, with a recipe for the set and a VLM that has its words."""
+    """A working folder with a recipe for the set and a VLM that has its words."""
     monkeypatch.chdir(tmp_path)
     folder = tmp_path / "wide"
     folder.mkdir()

@@ -1,4 +1,4 @@
-"""MetaWorld by several cameras: recorded, learned from and rolled out by the same ones."""
+"""MetaWorld with several cameras: recorded, learned from and rolled out with the same ones."""
 
 from __future__ import annotations
 
@@ -148,7 +148,7 @@ def test_another_single_camera_than_the_usual_is_remembered(
 def test_a_camera_that_is_called_otherwise_is_looked_by_all_the_same(
     dataset: Path, tmp_path: Path
 ) -> None:
-    """Renamed for the training, for LeRobot, or for both."""
+    """It is renamed for the training, for LeRobot, or for both."""
     known = wide(tmp_path)
     plain = trained(known, dataset, tmp_path / "plain", "gripperPOV")
     rename = {"gripperPOV": "front"}
@@ -176,7 +176,7 @@ def test_a_camera_that_is_called_otherwise_is_looked_by_all_the_same(
 
 @pytest.mark.parametrize("camera", ["gripperPOV", "corner2", "eye"])
 def test_lerobots_environment_shows_the_camera_that_was_asked_for(camera: str) -> None:
-    """Any other name is what the usual one's picture is called."""
+    """If another name is requested, the usual camera's picture gets that name."""
     path = ROOT / "plugins/lerobot_env_aegis/src/lerobot_env_aegis/task_env.py"
     found = importlib.util.spec_from_file_location("task_env", path)
     assert found is not None and found.loader is not None

@@ -1,4 +1,4 @@
-"""MetaWorld's tasks and sets by name, and what is refused; needs no MetaWorld."""
+"""MetaWorld's tasks and sets by name, and what is refused; does not need MetaWorld."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def test_a_set_knows_the_sentences_of_all_its_tasks() -> None:
 
 
 def kept(tasks: tuple[str, ...], fails: set[int], episodes: int) -> tuple[list, keeping.Seen]:
-    """The tasks of the kept episodes, where the episodes of the numbers `fails` fail."""
+    """The tasks of the kept episodes if the episodes with the numbers `fails` fail."""
 
     def recorded(number: int) -> RecordedEpisode:
         blank = [np.zeros((1, 1))] * 3
@@ -130,7 +130,7 @@ def test_an_unknown_name_leads_to_a_close_one(name: str, says: str) -> None:
 
 @pytest.fixture
 def without_metaworld(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As on a machine that has none, also where it is installed and imported."""
+    """As on a machine without it, even if it is installed and imported."""
     monkeypatch.delitem(sys.modules, "aegis_cli.sim.metaworld", raising=False)
     monkeypatch.setitem(sys.modules, "metaworld", None)
     monkeypatch.setitem(sys.modules, "metaworld.env_dict", None)

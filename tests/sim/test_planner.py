@@ -1,4 +1,4 @@
-"""The planner on problems whose best plan is known, and what it may never depend on."""
+"""The planner on problems with a known best plan, and what it must never depend on."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def random_plan(seed: int) -> np.ndarray:
 
 
 def near(goal: np.ndarray):
-    """What plans are worth whose every knot should be `goal`."""
+    """The values of plans whose every knot should be `goal`."""
     return lambda plans: -np.square(plans - goal).sum((1, 2))
 
 
@@ -74,7 +74,7 @@ def test_plans_stay_within_bounds_whatever_the_worth(seed: int) -> None:
     for _ in range(20):
         plan = improve(
             plan, near(np.full(plan.shape[1], 5.0)), 16, rng
-        )  # the best lies far outside
+        )  # the best plan is far outside
         assert np.abs(plan).max() <= 1
     assert plan.mean() > 0.8
 

@@ -1,4 +1,4 @@
-"""Environments in processes of their own: the same ones, and what becomes of errors."""
+"""Environments in processes of their own: they are equal, and errors are passed on."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def test_an_error_there_is_an_error_here() -> None:
     with opened(2, 3) as simulators:
         env = simulators.make(Wanted("point", 0))
         env.reset(episode_rng(3, EVALUATION, 1), SEEN)
-        for number in range(2):  # the process goes on
+        for number in range(2):  # the process continues
 
             def act(_: int) -> None:
                 env.step(np.array([np.nan, 0.0]))

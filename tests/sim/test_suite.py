@@ -39,7 +39,7 @@ import mujoco  # isort: skip  (after ours, which choose the OpenGL backend)
 from dm_control import suite as published  # isort: skip
 
 NAME = "suite/pendulum-swingup"
-# The first task of each domain, but for the two that take seconds to load.
+# The first task of each domain, except for the two that take seconds to load.
 LIGHT = [
     f"suite/{domain}-{own[0]}"
     for domain, own in published.TASKS_BY_DOMAIN.items()
@@ -59,10 +59,10 @@ def start(name: str, i: int = 0) -> suite.SuiteTask:
 
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A planner that hardly thinks, and episodes of 20 steps."""
+    """A planner with a minimal search, and episodes of 20 steps."""
     monkeypatch.setitem(KNOWN, "pendulum-swingup", QUICK)
     monkeypatch.setattr(suite, "STEPS", 20)
-    monkeypatch.setattr(processes, "_cores", lambda: 1)  # other processes would think as ever
+    monkeypatch.setattr(processes, "_cores", lambda: 1)  # other processes would not be patched
     recording._env.cache_clear()
 
 
@@ -138,7 +138,7 @@ def test_names_of_proprioception_lead_back_to_the_observation() -> None:
 
 
 def test_actions_span_the_suites_ranges() -> None:
-    """A quadruped's are uneven; lqr's forces have no bounds."""
+    """A quadruped's are asymmetric; lqr's forces have no bounds."""
     env = sim.make("suite/lqr-lqr_2_1")
     env.reset(episode_rng(0, EVALUATION, 0), ())
     env.step(np.ones(1))
@@ -168,13 +168,13 @@ def test_the_picture_is_upright() -> None:
 def test_terrain_is_drawn_as_it_is() -> None:
     """Environments share one rendering context, but each picture shows its own hills.
 
-    A context made anew shows the same.
+    A new context shows the same.
     """
     one, other = (sim.make("suite/quadruped-escape") for _ in range(2))
     one.reset(episode_rng(0, EVALUATION, 0), ())
     assert (
         one.physics._contexts is None
-    )  # a renderer of dm_control's own would fail at the interpreter's end
+    )  # a renderer of dm_control's own would fail when the interpreter exits
     second = other.reset(episode_rng(0, EVALUATION, 1), ()).image.astype(int)
     first = one._screen.render(one.physics.model.ptr, one.physics.data.ptr).astype(int)
     with mujoco.Renderer(other.physics.model.ptr, 64, 64) as renderer:
@@ -220,7 +220,7 @@ def test_asked_twice_the_expert_says_the_same_and_asking_changes_nothing() -> No
 
 
 def test_returns_hold_no_guide(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What leads the planner is not what an episode is worth.
+    """The guide of the planner does not count in an episode's return.
 
     A pendulum that hangs still earns nothing.
     """
@@ -250,7 +250,7 @@ def test_the_planner_does_better_than_chance(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_the_guides_lead_to_where_the_rewards_are() -> None:
-    """Among random states, the planner is led to those with the highest reward."""
+    """Among random states, the planner is guided to those with the highest reward."""
     guided = {
         known.guide: (name, known) for name, known in KNOWN.items() if known.guide is not None
     }
@@ -404,7 +404,7 @@ def test_equal_arguments_give_equal_bytes_on_any_machine(
         (1, 0),
         (3, 0),
         (1, 1),
-    ):  # the planner's threads are the cores that no process needs
+    ):  # the planner's threads use the cores that no process needs
         monkeypatch.setattr(processes, "_cores", lambda: cores)
         digests.append(demos.run(NAME, 2, seed, tmp_path / "d.safetensors", workers=1).sha256)
     assert digests[0] == digests[1] != digests[2]
@@ -440,7 +440,7 @@ def test_a_rate_that_is_no_whole_number_makes_a_video_all_the_same(
 
 @pytest.fixture
 def place(quick: None, tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder to work in, with a recipe for the suite task."""
+    """A working folder with a recipe for the suite task."""
     monkeypatch.chdir(tmp_path)
     settings = dataclasses.replace(
         recipe(tiny_folder, methods=("naive",)), task=NAME, demos=Demos(episodes=2, drop_below=0.5)
@@ -531,7 +531,7 @@ def test_a_rollout_sums_what_the_environment_gives(
 def test_a_video_runs_at_the_speed_of_the_robot(
     monkeypatch: pytest.MonkeyPatch, quick: None
 ) -> None:
-    """50 steps a second, 10 frames a second."""
+    """50 steps per second, 10 frames per second."""
     shown: list[media.Clip] = []
     monkeypatch.setattr(
         checkpoint, "load_policy", lambda _: (Puppet(0.0), {"task": NAME, "replan": 3})
@@ -636,7 +636,7 @@ def test_a_quantile_for_a_task_without_returns(aegis, place: Path) -> None:
     "command", [("run", "small.yaml", "--out", "runs"), (*TRAIN, "--dry-run"), TRAIN]
 )
 def test_a_task_that_the_suite_does_not_have(command: tuple[str, ...], aegis, place: Path) -> None:
-    """Its name has the right form, so only making it can tell; nothing is written before that."""
+    """Its name has a valid form, so only making it can tell; nothing is written before that."""
     demos.run(NAME, 2, 0, place / "d.safetensors", workers=1)
     before = sorted(place.rglob("*"))
     message = refused(aegis(*command, "--set", "task=suite/pendulum-swungup"))

@@ -21,8 +21,8 @@ VOCABULARY |= set("target pad finger ball mass arm object the to onto at on".spl
 SUITE_TASKS = (
     "suite/pendulum-swingup",
     "suite/finger-turn_easy",
-)  # one that is plain, one that writes to its model
-# Two that write to their models, and a task of a set that is not its first.
+)  # a plain one, and one that writes to its model
+# Two that write to their models, and a task of a set that is not its first one.
 METAWORLD_TASKS = (
     ("metaworld/button-press", 0),
     ("metaworld/drawer-open", 0),
@@ -33,7 +33,7 @@ LIBERO_TASKS = (("libero/goal", 2),)
 
 @dataclass(frozen=True)
 class Made:
-    """How an environment was made, so that another like it can be."""
+    """How an environment was made, so that an equal one can be made."""
 
     name: str
     number: int = 0
@@ -67,7 +67,7 @@ def any_env(made: Made) -> TaskEnv:
 
 
 def an_action(env: TaskEnv) -> np.ndarray:
-    """The expert's; of a task that has none, always the same push."""
+    """The expert's action; for a task without an expert, always the same push."""
     if of_datasets(env.spec.name) is None:
         return env.expert_action()
     return np.linspace(-1, 1, len(env.spec.action_names), dtype=np.float32)
@@ -78,7 +78,7 @@ def start(env: TaskEnv, i: int = 0, colors: tuple[str, ...] = COLORS):
 
 
 def finish(env: TaskEnv, act) -> Step:
-    """The last step of an episode, in which nobody looks."""
+    """The last step of an episode; nothing is rendered."""
     while True:
         step = env.step(act(), look=False)
         if step.done:
@@ -292,9 +292,9 @@ def test_instruction_names_the_true_target_only(env: TaskEnv) -> None:
 
 
 def test_the_named_colour_lies_where_success_is(env: TaskEnv) -> None:
-    """The picture shows the target's colour at the spot that `distance` measures to.
+    """The picture shows the target's colour at the position from which `distance` measures.
 
-    An effector that ends there is under it.
+    An effector that ends there covers it.
     """
     start(env, 4)
     before = pixels_of(env.observe().image, env.target_color)

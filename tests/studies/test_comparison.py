@@ -76,7 +76,7 @@ def test_the_choice_is_the_most_accurate_of_the_able_else_the_most_able(seed: in
             )
         else:
             assert own[chosen].success == max(p.success for p in own)
-        assert chosen == own.index(own[chosen])  # of equals, the one written first
+        assert chosen == own.index(own[chosen])  # among equals, the one listed first
 
 
 @pytest.mark.parametrize("best", range(10, 101))
@@ -124,7 +124,7 @@ def test_a_value_that_diverged_is_chosen_only_where_all_did(seed: int) -> None:
 
 
 def test_where_nothing_is_rolled_out_the_error_takes_the_place_of_success() -> None:
-    """Also beyond 1, where an error is above that of always the mean action."""
+    """This includes errors above 1, the error of always predicting the mean action."""
     lost = PolicyPoint("a", "lora", None, 1.0, None, None)
     for seed in range(20):
         points = invented(seed)
@@ -201,7 +201,7 @@ def test_each_demand_of_the_bar_is_needed(
 
 
 def evaluated(error: float, hold: float | None = None, **changes: Any) -> PolicyFigures:
-    """A policy that cannot be rolled out, evaluated on forty episodes of little variety."""
+    """A policy that cannot be rolled out, evaluated on forty similar episodes."""
     spread = [0.001 * (i % 5 - 2) for i in range(40)]
     known: dict[str, Any] = {
         "open_loop_error": error,
@@ -227,15 +227,15 @@ def judged_open_loop(
     return task_results("arm", rows, variants, {}, costs, frozenset(), most).results[1]
 
 
-LEVELS = (0.3, 0.4, 0.5)  # of naive's error with each seed: they hold out other episodes
+LEVELS = (0.3, 0.4, 0.5)  # naive's error for each seed: the seeds hold out different episodes
 
 
 @pytest.mark.parametrize(
     ("rises", "hold", "most", "passed"),
     [
         ((0.009, 0.01, 0.011), None, 0.02, [True, True]),
-        ((0.009, 0.01, 0.011), None, 0.01, [False, True]),  # the upper end is beyond
-        ((0.0, 0.01, 0.02), None, 0.02, [False, True]),  # on average within, and not surely
+        ((0.009, 0.01, 0.011), None, 0.01, [False, True]),  # the upper end is above the limit
+        ((0.0, 0.01, 0.02), None, 0.02, [False, True]),  # below it on average, but not certainly
         ((-0.2, -0.2, -0.21), None, 0.0, [True, True]),
         ((0.0, 0.001, 0.002), 0.3, 0.02, [True, False]),  # as good as naive, and as useless
         ((0.0, 0.001, 0.002), 0.9, 0.02, [True, True]),
@@ -245,7 +245,7 @@ LEVELS = (0.3, 0.4, 0.5)  # of naive's error with each seed: they hold out other
 def test_what_cannot_be_rolled_out_is_judged_by_its_error_beside_naives(
     rises: tuple[float, ...], hold: float | None, most: float, passed: list[bool]
 ) -> None:
-    """Paired by seed, and by the worse end of the interval; nothing is asked of success."""
+    """Paired by seed, and judged by the worse end of the interval; success plays no part."""
     levels = zip(LEVELS, rises, strict=True)
     other = [evaluated(level + rise, hold) for level, rise in levels]
     result = judged_open_loop([evaluated(level, hold) for level in LEVELS], other, most)
@@ -257,7 +257,7 @@ def test_what_cannot_be_rolled_out_is_judged_by_its_error_beside_naives(
 
 
 def test_errors_are_paired_by_episode_and_those_of_an_earlier_version_by_seed_alone() -> None:
-    """Episodes differ by more than the two policies do."""
+    """The episodes differ by more than the two policies do."""
     hard = tuple(0.1 + 0.02 * i for i in range(40))
     naive = [evaluated(0.49, error_per_episode=hard) for _ in range(3)]
     # Each seed's mean rises by a little less or more, and within it one episode by much.
@@ -272,7 +272,7 @@ def test_errors_are_paired_by_episode_and_those_of_an_earlier_version_by_seed_al
 
 
 def test_one_bar_is_held_up_to_all_variants_of_a_task() -> None:
-    """Also to one of which nothing is left, so that a table has one line per demand."""
+    """This includes a variant without any result, so that a table has one line per demand."""
     rows: dict[str, dict[int, Any]] = {"a": {0: Divergence(1)}, "b": {0: evaluated(0.5)}}
     variants = {"a": PolicyVariant("lora"), "b": PolicyVariant("ewc")}
     lost, kept = task_results("arm", rows, variants, {}, {}, frozenset()).results
@@ -305,7 +305,7 @@ def test_a_failed_demand_outweighs_one_that_was_not_measured() -> None:
 
 
 def test_gains_are_paired_by_seed() -> None:
-    """However much seeds differ, a variant two points better with each is two points better."""
+    """However much seeds differ, a variant two points better for each is two points better."""
     draw = random.Random(0)
     levels = {seed: draw.uniform(0.5, 0.9) for seed in range(5)}
     base = row(Recipe(name="x"))
@@ -334,7 +334,7 @@ def test_gains_are_paired_by_seed() -> None:
 
 
 def test_a_variant_is_compared_with_the_reference_that_it_names() -> None:
-    """As naive of another rate: gains and the drop's difference are to that one."""
+    """For example naive at another rate: gains and the drop's difference are relative to that."""
     base = row(Recipe(name="x"))
     success = {"naive": 0.9, "naive-low": 0.6, "aegis-low": 0.65, "aegis": 0.85}
     drops = {"naive": 20.0, "naive-low": 2.0, "aegis-low": 5.0, "aegis": 19.0}
@@ -414,7 +414,7 @@ def test_a_mean_leaves_out_what_a_method_does_not_have(order: tuple[int, ...]) -
 def test_seeds_that_came_out_alike_do_not_tell_how_seeds_vary(
     lost: float, passed: bool | None
 ) -> None:
-    """Unless the backbone has not moved: then no answer could have been another."""
+    """Unless the backbone has not moved: then no answer could have changed."""
     base = dataclasses.replace(row(Recipe(name="x")), drop_points=lost, cross_entropy=0.2)
     variants = {"naive": PolicyVariant("naive"), "other": PolicyVariant("lora")}
     rows = {name: dict.fromkeys(range(2), base) for name in variants}
@@ -428,7 +428,7 @@ def test_seeds_that_came_out_alike_do_not_tell_how_seeds_vary(
 
 
 def test_a_share_at_which_all_seeds_came_out_alike_has_no_interval() -> None:
-    """That no episode of few ended in another target is no certainty that none would."""
+    """If none of a few episodes ended at another target, it is not certain that none would."""
     base = dataclasses.replace(row(Recipe(name="x")), wrong_target=0.0, cross_entropy=0.2)
     variants = {"naive": PolicyVariant("naive")}
     alike = {"naive": dict.fromkeys(range(3), base)}
@@ -490,7 +490,7 @@ def test_a_merged_policy_has_a_verdict() -> None:
 
 
 def test_a_seed_that_diverged_counts_in_no_estimate_and_costs_the_bar() -> None:
-    """The others are as good as can be, so that nothing else fails."""
+    """The others are as good as possible, so nothing else fails."""
     base = dataclasses.replace(row(Recipe(name="x")), success_seen=0.8, success_held_out=0.8)
     variants, costs = (
         {"naive": PolicyVariant("naive"), "other": PolicyVariant("lora")},
@@ -531,7 +531,7 @@ def test_a_variant_of_which_nothing_is_left_has_no_figures() -> None:
 
 @pytest.mark.parametrize("kind", [PolicyResult, StreamResult, Accuracies, PairResult])
 def test_every_mean_of_a_result_is_declared_once(kind: type) -> None:
-    """A figure that is not declared would be neither measured nor shown."""
+    """A figure without a declaration would be neither measured nor shown."""
     hints = get_type_hints(kind)
     means = {name for name, hint in hints.items() if hint == Mean}
     declared = columns(kind)

@@ -1,4 +1,4 @@
-"""Cells whose policies are merged between training and measuring."""
+"""Cells whose policies are merged between training and measurement."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_a_merge_is_part_of_a_cells_key_and_none_is_not(small: Recipe) -> None:
         return cell_key(Cell("a", replace(small, merge=merge)), "0" * 64)
 
     plain = key(Merge())
-    assert key(Merge(strength=3.0)) == plain  # without a method it shapes nothing
+    assert key(Merge(strength=3.0)) == plain  # without a method it has no effect
     others = [Merge("linear", 0.5), Merge("linear", 0.6), Merge("factors"), Merge("factors", 3.0)]
     keys = {key(merge) for merge in others}
     assert len(keys) == len(others) and plain not in keys
@@ -64,7 +64,7 @@ def test_the_merged_policy_is_measured_and_a_second_run_does_nothing(
 
 @pytest.fixture(scope="module")
 def job(small: Recipe, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A job of one method, merged half of the way back."""
+    """A job with one method, merged half-way back."""
     folder = tmp_path_factory.mktemp("merged")
     pipeline.run(replace(small, merge=Merge("linear", 0.5)), folder)
     return folder / "small"
@@ -126,7 +126,7 @@ def test_a_run_that_was_merged_says_so_to_those_who_take_its_weights(
 
 
 def as_earlier(job: Path) -> None:
-    """Lay a job as an earlier version did, whose merged checkpoints did not know their loss."""
+    """Write a job like an earlier version, whose merged checkpoints had no loss."""
     merged = job / "naive" / "merged"
     for name in ("merge.json", "probe.json", "rollout-seen.json", "rollout-held-out.json"):
         (merged / name).rename(job / "naive" / name)
@@ -170,7 +170,7 @@ def test_another_training_takes_the_place_of_one_that_was_merged(
     longer = replace(small, train=replace(small.train, steps=3), merge=Merge("linear", 0.5))
     pipeline.run(longer, tmp_path)
     assert (tmp_path / "small/naive/merged/probe.json").exists()
-    assert not list((tmp_path / "small").glob("naive.*"))  # nothing of it was somebody else's
+    assert not list((tmp_path / "small").glob("naive.*"))  # nothing in it was somebody else's
 
 
 def test_another_strength_merges_anew_and_does_not_train(small: Recipe, tmp_path: Path) -> None:

@@ -42,7 +42,7 @@ def own_robot(folder: Path, backbone: Path, count: int, **changes: Any) -> dict[
 def test_values_are_chosen_by_the_error_on_episodes_that_judge_nobody(
     tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The compared seeds hold out other episodes than each other, and none of those."""
+    """The compared seeds hold out different episodes from each other, and none of those."""
     studies.fake_bench(monkeypatch)
     knob = {"naive": {"method": "naive", "tune": {"train.backbone_lr": [1e-3, 1e-2]}}}
     keys = own_robot(tmp_path / "arm", tiny_folder, 20, variants=knob, keep_runs=True)
@@ -68,7 +68,7 @@ def test_values_are_chosen_by_the_error_on_episodes_that_judge_nobody(
 def test_further_seeds_may_leave_other_episodes_to_tune_on(
     tiny_folder: Path, tmp_path: Path
 ) -> None:
-    """A value that was chosen on an episode that now judges would be chosen anew."""
+    """A value chosen on an episode that now serves for judging would be chosen again."""
     keys = own_robot(tmp_path / "d", tiny_folder, 20)
     found = []
     for seeds in ([0, 1], [0, 1], [0, 1, 2]):
@@ -105,7 +105,7 @@ def test_values_are_not_chosen_where_no_episode_is_left_or_acting_is_not_one_fig
 def test_a_study_that_named_a_task_goes_on_where_it_was(
     tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its cells keep their folders, and are known as well once the recipe leaves the task out."""
+    """Its cells keep their folders, and are found even if the recipe no longer names the task."""
     studies.fake_bench(monkeypatch)
     variants = {"naive": {"method": "naive"}, "kept": {"method": "stop-gradient"}}
     keys = own_robot(tmp_path / "d", tiny_folder, 5, tuning=None, variants=variants)
@@ -160,7 +160,7 @@ def test_each_of_several_sets_counts_alike_however_long_it_is() -> None:
 def test_a_study_without_tasks_is_named_by_its_demonstrations(
     path: str | list[str], name: str, tmp_path: Path
 ) -> None:
-    """The recipes of its cells are those of a study of the default task."""
+    """The recipes of its cells are those of a study with the default task."""
     tuning = {key: value for key, value in studies.TUNING.items() if key != "task"}
     shared = {"demos": {"path": path}}
     keys = studies.raw("embedded", tasks=None, tuning=tuning, shared=shared)
@@ -198,7 +198,7 @@ def test_what_a_study_of_demonstrations_lacks_is_refused(
 
 
 def test_what_nothing_limits_is_no_share_however_few_units_there_are() -> None:
-    """A squared error may be of any size: a share's interval says nothing of it."""
+    """A squared error has no upper limit, so a share's interval does not apply to it."""
     seeds = [Units(np.array([0.4, 0.5, level]), np.ones(3)) for level in (0.6, 0.7)]
     wide, own = crossed_interval(seeds), crossed_interval([replace(s, reach=None) for s in seeds])
     assert wide is not None and own is not None

@@ -1,4 +1,4 @@
-"""`aegis run`: what a stage read decides whether it runs again, and an interrupted run goes on."""
+"""`aegis run`: a stage's inputs decide whether it runs again; an interrupted run resumes."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def small(tiny_folder: Path) -> Recipe:
 
 @pytest.fixture(scope="module")
 def finished(small: Recipe, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A root folder with the recipe run once, never touched again."""
+    """A root folder in which the recipe was run once; never modified."""
     root = tmp_path_factory.mktemp("pipeline")
     pipeline.run(small, root)
     return root
@@ -72,13 +72,13 @@ def finished(small: Recipe, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def root(finished: Path, tmp_path: Path) -> Path:
-    """A copy of it to change."""
+    """A copy of it that tests may change."""
     return Path(shutil.copytree(finished, tmp_path / "runs", symlinks=True))
 
 
 @pytest.fixture
 def calls(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
-    """How often each stage did its work."""
+    """The number of times that each stage did its work."""
     counted: Counter[str] = Counter()
     for module, name, label in (
         (record, "run", "demos"),
@@ -280,7 +280,7 @@ def test_a_gate_fails_after_the_tables_are_written(
 def test_a_job_does_not_begin_with_a_run_of_its_own_which_it_would_remove(
     key: str, small: Recipe, root: Path
 ) -> None:
-    """As where a recipe was copied for a second training, and kept its name."""
+    """As when a recipe was copied for a second training and kept its name."""
     run = root / "small" / METHODS[0]
     before = {path: path.stat().st_mtime_ns for path in run.rglob("*")}
     other = replace(small, seed=small.seed + 1)
@@ -301,7 +301,7 @@ SETS = ("scenes", "easy-vqa")
 
 @pytest.fixture(scope="module")
 def two_sets(tmp_path_factory: pytest.TempPathFactory) -> tuple[Recipe, Path]:
-    """A recipe whose anchor knows easy-VQA alone and whose probes ask both, run once."""
+    """A recipe with an anchor on easy-VQA alone and probes on both sets, run once."""
     folder = tmp_path_factory.mktemp("two-sets")
     make_tiny(words=wide_vocabulary()).save(folder / "backbone")
     made = recipe(folder / "backbone", ("naive",))
@@ -343,7 +343,7 @@ def test_a_second_run_of_several_sets_does_nothing(
 def test_the_gate_holds_every_set_to_its_limit(
     own: float, other: float, passes: bool, gate: str
 ) -> None:
-    """By the mean, or by the upper end of the interval, which lies farther."""
+    """By the mean, or by the upper end of the interval, which is higher."""
     shift = 0.0 if gate == "mean" else -5.0
 
     def held(drop: float) -> dict[str, Any]:
@@ -357,7 +357,7 @@ def test_the_gate_holds_every_set_to_its_limit(
 
 
 def test_a_gate_of_a_recipe_does_not_ask_again_what_was_asked_without_one() -> None:
-    """Records of probes are older than the key."""
+    """Existing records of probes are from before the key."""
     settings = Probe(max_drop=1.0)
     assert "gate" not in policy_cells._probe_settings(settings)
     assert policy_cells._probe_settings(replace(settings, gate="upper"))["gate"] == "upper"
@@ -451,7 +451,7 @@ def test_other_steps_rerun_all_but_demonstrations_and_anchor(
         "000002",
         "000003",
         "last",
-    ]  # nothing of the old run
+    ]  # nothing from the old run
     assert (checkpoints / "last").resolve().name == "000003"
 
 
@@ -468,7 +468,7 @@ def test_a_new_method_leaves_the_others_alone(
     report = pipeline.run(replace(small, methods=("stop-gradient", "aegis")), root)
     assert calls == {"train": 1, "probe": 1, "rollout": 2}
     assert [row.method for row in report.rows] == ["stop-gradient", "aegis"]
-    assert [row.step_time_ratio for row in report.rows] == [None, None]  # no naive to compare with
+    assert [row.step_time_ratio for row in report.rows] == [None, None]  # no naive for comparison
     assert report.rows[0].drop_points == 0
 
 
@@ -495,7 +495,7 @@ def test_other_demonstrations_rerun_all_but_the_anchor(
 def test_an_anchor_on_robot_frames_is_measured_anew_with_the_demonstrations(
     small: Recipe, tmp_path: Path, calls: Counter[str]
 ) -> None:
-    """Its distance to the probe's questions is in the probe's report, and no drift in the table."""
+    """Its distance to the probe's questions is in the probe's report; the table shows no drift."""
     frames = replace(small.anchor, source="demos", parts=("moments",))
     shown = replace(small, methods=("aegis",), anchor=frames)
     report = pipeline.run(shown, tmp_path)
@@ -518,7 +518,7 @@ def test_an_anchor_on_robot_frames_is_measured_anew_with_the_demonstrations(
 @pytest.mark.parametrize(
     ("victim", "again"),
     [
-        ("demos.safetensors", {"demos": 1}),  # equal bytes come back, so nothing else has changed
+        ("demos.safetensors", {"demos": 1}),  # the new bytes are equal, so nothing else has changed
         ("anchor.safetensors", {"anchor": 1}),
         ("naive/probe.json", {"probe": 1}),
         ("aegis/rollout-held-out.json", {"rollout": 1}),
@@ -538,7 +538,7 @@ def test_a_lost_or_changed_output_is_made_again(
     path.unlink() if deleted else path.write_bytes(flipped(before))
     pipeline.run(small, root)
     assert calls == again
-    assert path.read_bytes() == before or path.suffix == ".json"  # reports hold times
+    assert path.read_bytes() == before or path.suffix == ".json"  # reports contain times
 
 
 def test_overwrite_runs_every_stage_again_to_the_same_bytes(
@@ -568,7 +568,7 @@ def test_a_damaged_run_is_trained_again_to_the_same_bytes(
         model = load(str(path))
         with torch.no_grad():
             model.words.weight.mul_(2)
-        model.save(path.parent)  # sound, but not what was trained
+        model.save(path.parent)  # valid, but not what was trained
     else:
         path.write_bytes(flipped(path.read_bytes()))
     pipeline.run(small, root)
@@ -582,7 +582,7 @@ def test_a_damaged_run_is_trained_again_to_the_same_bytes(
 
 
 def test_a_run_that_was_trained_by_hand_is_left_alone(small: Recipe, root: Path) -> None:
-    """At the place of one of the recipe's methods, and nothing says that `aegis run` began it."""
+    """It is in the place of one of the recipe's methods, without a sign of `aegis run`."""
     (root / "small/stages/naive.json").unlink()
     before = content(root / "small/naive")
     with pytest.raises(AegisError, match="not empty") as caught:
@@ -594,7 +594,7 @@ def test_a_run_that_was_trained_by_hand_is_left_alone(small: Recipe, root: Path)
 def test_a_run_with_files_of_the_users_own_is_moved_aside(
     small: Recipe, root: Path, name: str
 ) -> None:
-    """Settings that change make a run anew, and nobody's notes are removed with the old one."""
+    """Changed settings start a new run, but a user's notes are not removed with the old one."""
     own = root / "small" / "naive" / name
     own.parent.mkdir(exist_ok=True)
     own.write_text("weeks of work")
@@ -624,7 +624,7 @@ def test_an_interrupted_training_goes_on(
         pipeline.run(small, tmp_path, stop)
     calls.clear()
     pipeline.run(small, tmp_path, seen.append)
-    # From the checkpoint of step 2 on.
+    # From the checkpoint of step 2.
     assert [e.done for e in seen if e.stage == "aegis/train"] == [2, 3, 4]
     assert {"demos", "anchor", "naive/train", "naive/rollout seen"} <= up_to_date(seen)
     assert calls == {"train": 1, "probe": 1, "rollout": 2}
@@ -728,7 +728,7 @@ def test_the_verdict_says_what_the_table_does(rows: list[Any], says: str) -> Non
 
 
 def asked_twice(rows: list[Any], **others: float) -> list[Any]:
-    """The same rows, which were also asked other questions and lost these points of them."""
+    """The same rows, which were also asked other questions and lost these points on them."""
     again = {name.replace("_", "-"): drop for name, drop in others.items()}
     return [
         replace(row, others={"other": SimpleNamespace(drop_points=drop, drop_interval=ends)})
@@ -776,7 +776,7 @@ def test_the_verdict_on_questions_that_the_vlm_could_not_answer_is_no_verdict_on
 def test_an_anchor_of_answers_that_the_backbone_is_sure_of_is_warned_of(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # The rest of what a map reads takes seconds, and nothing of it is told here.
+    # Measuring the rest of a map's inputs takes seconds and is not used here.
     monkeypatch.setattr(moment_sums, "make", lambda width, at, *_: TraceOnly(width, at))
     settings = Anchor(samples=60, vqa="easy-vqa", parts=("curvature",))
     events: list[Event] = []

@@ -1,4 +1,4 @@
-"""`aegis run` of a recipe by two processes leads to what one process finds."""
+"""`aegis run` by two processes gives the results of a single process."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ OF_TIME = ("step_s", "step_time_ratio")
 
 @dataclass(frozen=True)
 class Told:
-    """What the processes of each job were told, by their numbers."""
+    """The output of each job's processes, by their numbers."""
 
     first: list[dict[str, Any]]
     again: list[dict[str, Any]]
@@ -40,7 +40,7 @@ def small(tiny_folder: Path) -> Recipe:
 
 @pytest.fixture(scope="module")
 def told(small: Recipe, tmp_path_factory: pytest.TempPathFactory) -> Told:
-    """A recipe that two processes ran, ran again, and then with what has to fail."""
+    """A recipe run by two processes, run again, and then with something that must fail."""
     out = tmp_path_factory.mktemp("together")
     wrong = replace(small, probe=Probe(vqa="questions/typo.jsonl"))
     gated = out / "gated.yaml"
@@ -64,7 +64,7 @@ def alone(small: Recipe, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def assert_near(here: Any, there: Any) -> None:
-    """Equal, numbers up to rounding."""
+    """Equal, with numbers equal up to rounding."""
     if isinstance(here, dict):
         assert here.keys() == there.keys()
         for name in here.keys() - set(OF_TIME):
@@ -111,7 +111,7 @@ def test_a_second_run_does_nothing(told: Told) -> None:
 
 
 def test_what_one_process_made_is_up_to_date_for_two(told: Told, small: Recipe) -> None:
-    """And the other way round: the records do not know how many processes there were."""
+    """And the other way round: the records do not contain the number of processes."""
     stages: list[str] = []
     pipeline.run(small, told.root, lambda event: stages.append(event.stage))
     assert all(stage in ("small", METHOD) or "(up to date)" in stage for stage in stages)

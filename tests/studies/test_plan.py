@@ -1,4 +1,4 @@
-"""`aegis run --dry-run`: what it says is what the job then does, and it writes nothing."""
+"""`aegis run --dry-run`: it says what the job then does, and writes nothing."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def small(tiny_folder: Path) -> Recipe:
 
 @pytest.fixture(scope="module")
 def finished(small: Recipe, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A root folder with the recipe run once, never touched again."""
+    """A root folder in which the recipe was run once; never modified."""
     root = tmp_path_factory.mktemp("planned")
     pipeline.run(small, root)
     return root
@@ -43,12 +43,12 @@ def finished(small: Recipe, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def root(finished: Path, tmp_path: Path) -> Path:
-    """A copy of it to change."""
+    """A copy of it that tests may change."""
     return Path(shutil.copytree(finished, tmp_path / "runs", symlinks=True))
 
 
 def due(found: JobPlan) -> dict[str, str]:
-    """Why each stage would run that would."""
+    """The reason for each stage that would run."""
     return {one.stage: one.due for one in found.stages if one.due is not None}
 
 
@@ -61,7 +61,7 @@ def job(wanted: Recipe, root: Path, **options: Any) -> JobPlan:
 
 
 def skipped(wanted: Recipe, root: Path) -> set[str]:
-    """The stages that a job says are up to date, as it is run."""
+    """The stages that a job reports as up to date while it runs."""
     events: list[Event] = []
     pipeline.run(wanted, root, events.append)
     told = [e.stage for e in events if isinstance(e, Progress) and e.stage.endswith(SKIPPED)]
@@ -155,7 +155,7 @@ def test_a_training_whose_inputs_are_there_says_what_it_needs(small: Recipe, roo
     for method, report in told.items():
         assert (report.method, report.steps) == (method, 9)
         assert report.out == str(root / "small" / method)
-        # One training takes memory that the one before it has left to the process.
+        # The training needs memory that the previous one has left to the process.
         assert report.memory_measured_mb is None
         assert report.memory_needed_mb == report.memory_total_mb > 0
         assert report.step_s is not None and report.validation_s is not None
@@ -178,7 +178,7 @@ def test_a_training_that_was_interrupted_goes_on(small: Recipe, root: Path) -> N
     report = job(longer, root).trainings["naive"]
     assert report is not None and report.hours is not None
     assert report.step_s is not None and report.validation_s is not None
-    # The checkpoint after two steps is gone on from; validations follow after 4 steps and after 6.
+    # It resumes from the checkpoint after two steps; validations follow after steps 4 and 6.
     left = 4 * report.step_s + 2 * report.validation_s["loss"]
     assert report.hours == pytest.approx(left / 3600)
 

@@ -1,6 +1,6 @@
-"""`aegis run` with a study of a robot stream: every cell once, with data of its seed.
+"""`aegis run` with a study of a robot stream: every cell once, with its seed's own data.
 
-Its figures are those that the streams themselves have.
+Its figures are those of the streams themselves.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def write(folder: Path, keys: dict[str, Any]) -> Path:
 
 
 def study(folder: Path, backbone: Path | str = "embedded", **changes: Any) -> Any:
-    """The study as it is read from a file."""
+    """The study as read from a file."""
     loaded = study_cells.load(write(folder, raw(backbone, **changes)))
     assert isinstance(loaded, RobotStreamStudyRecipe)
     return loaded
@@ -101,7 +101,7 @@ def figures(**changes: Any) -> RobotStreamFigures:
 def finished(
     tiny_folder: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Any, Path, list[Path]]:
-    """A study that was run whole, its folder, and the recordings that it made; read only."""
+    """A complete run of a study, its folder, and the recordings that it made; read-only."""
     folder = tmp_path_factory.mktemp("study")
     asked = study(folder, tiny_folder, keep_runs=True)
     report = stage.run(asked, folder)
@@ -130,7 +130,7 @@ def test_the_figures_are_those_of_the_streams_alone(
             assert cell["cross_entropy"] == [each.cross_entropy for each in one.vqa]
             alone.append(one)
     told = [cell["cross_entropy"] for cell in cells.values()]
-    assert len({tuple(one) for one in told}) == 4  # each asks other questions, or learns otherwise
+    assert len({tuple(one) for one in told}) == 4  # each has other questions or another training
     for result in report.results:
         alone = [
             train.run(
@@ -229,7 +229,7 @@ def test_a_run_is_cleared_without_the_folder_where_another_may_begin(tmp_path: P
     runner.tidy(["stream/igsp/3"])
     assert (folder / "4.begun").is_file()
     runner.clear("stream/igsp/4")
-    (tmp_path / "stream" / "kept").mkdir()  # nobody's label
+    (tmp_path / "stream" / "kept").mkdir()  # not the label of any run
     runner.tidy(["stream/igsp/3", "stream/igsp/4"])
     assert not folder.exists() and (tmp_path / "stream" / "kept").is_dir()
 

@@ -1,6 +1,6 @@
-"""What a study of streams says of rows worked by hand.
+"""A study of streams, on hand-written rows.
 
-It gives intervals, ratios, the rule that chooses a knob, and the bar.
+The tests cover intervals, ratios, the rule that chooses a knob, and the bar.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ LASTS = [0.79, 0.81, 0.80, 0.84]  # of mine; the isolated LoRA's are 0.80
 def found(
     pairs: dict[str, Any] | None = None, **mine: Any
 ) -> dict[str, dict[tuple[str, int], Any]]:
-    """Rows by hand; `mine` changes all of my main rows, `pairs` those of both pairs."""
+    """Hand-written rows; `mine` changes all of my main rows, `pairs` those of both pairs."""
     rows = {
         run: row(last=last, average=0.7, parameters=400, **mine)
         for run, last in zip(RUNS, LASTS, strict=True)
@@ -71,7 +71,7 @@ def close(estimate: Estimate, mean: float, half: float | None) -> None:
 
 
 def test_a_seeds_figure_is_the_mean_over_its_streams_and_intervals_are_over_seeds() -> None:
-    """Streams are named, not drawn: they are no runs more."""
+    """Streams are named, not drawn at random, so they do not count as more runs."""
     made = mine(found())
     half = T_1 * (0.825 - 0.795) / 2  # seed 0 has 0.79 and 0.80, seed 1 has 0.81 and 0.84
     close(made.told.last, 0.81, half)
@@ -81,7 +81,7 @@ def test_a_seeds_figure_is_the_mean_over_its_streams_and_intervals_are_over_seed
     close(made.transfer_gain_points, 0.0, 0.0)
     assert (
         made.told.last.runs == made.pair_a.added.runs == 2
-    )  # a pair is no part of the main figures
+    )  # pairs do not count in the main figures
     close(made.pair_a.added, 0.1, 0.0)
     close(made.pair_a.new_experts, 0.5, 0.0)
     close(made.pair_a.reuse, 0.5, 0.0)
@@ -89,7 +89,7 @@ def test_a_seeds_figure_is_the_mean_over_its_streams_and_intervals_are_over_seed
 
 
 def test_what_learns_nothing_has_no_interval_and_is_compared_with_each_seed() -> None:
-    """Two streams, one figure, however many seeds the cell was delivered to."""
+    """Two streams, one figure, however many seeds share the cell."""
     rows = found()
     rows["zero-shot"] = {
         run: row(transfer=t, last=t, first_change=0.0)
@@ -200,7 +200,7 @@ def test_a_lora_of_half_the_rank_is_the_control_of_the_same_size() -> None:
 
 
 def test_noise_between_seeds_does_not_help() -> None:
-    """With the higher mean, whose interval reaches far under 0, nothing is shown."""
+    """Its mean is higher, but the interval extends far below 0, so nothing is shown."""
     rows = steady()
     assert mine(rows).bar.passed is True
     noisy = zip(RUNS, (0.70, 0.99, 0.75, 0.99), strict=True)

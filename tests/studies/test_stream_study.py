@@ -1,6 +1,6 @@
-"""`aegis run` with a study of streams: every cell once, cut anywhere.
+"""`aegis run` with a study of streams: every cell once, interrupted anywhere.
 
-Its figures are those that the streams themselves have.
+Its figures are those of the streams themselves.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ COMPARED = [
     for place in PLACES
     for name in VARIANTS
     if name != "zero-shot" or not seed
-]  # its seeds are all the same
+]  # all its seeds are equal
 
 
 class Stop(Exception):
@@ -65,9 +65,9 @@ def learned(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, bool]]:
 
 
 def invent(monkeypatch: pytest.MonkeyPatch, stop_after: int | None = None) -> list[str]:
-    """Rows by a formula instead of runs; returns the labels asked for.
+    """Rows by a formula instead of runs; returns the labels of the calls.
 
-    The call after `stop_after` is a Ctrl-C.
+    The call after `stop_after` raises a Ctrl-C.
     """
     labels: list[str] = []
 
@@ -84,7 +84,7 @@ def invent(monkeypatch: pytest.MonkeyPatch, stop_after: int | None = None) -> li
 
 
 def timeless(table: Any) -> Any:
-    """A report without where it lies and how long it took."""
+    """A report without its path and its duration."""
     plain = json.loads(json.dumps(table))
     plain.pop("out")
     for result in plain["results"]:
@@ -146,7 +146,7 @@ def test_pictures_behind_links_and_others_of_their_size_are_told_apart(tmp_path:
         for part in ("train", "test"):
             (root / "one" / part).symlink_to(real / part)
         found.append(images.image_set(dataclasses.replace(made, path=str(root))))
-        (root / "two").symlink_to(real)  # one more link on the way to the same files
+        (root / "two").symlink_to(real)  # another link on the way to the same files
         assert (
             folders.contents(root / "two")
             == folders.contents(real)
@@ -158,7 +158,7 @@ def test_pictures_behind_links_and_others_of_their_size_are_told_apart(tmp_path:
 def test_a_study_through_the_command_line_interrupted_and_not(
     aegis: Aegis, tmp_path: Path, learned: list[tuple[str, bool]]
 ) -> None:
-    """One seed; the streams' own reports say what the table must hold."""
+    """One seed; the streams' own reports give the values that the table must have."""
     path = write(tmp_path, raw(seeds=[3], keep_runs=True))
     code, out, err = aegis("run", path, "--out", tmp_path / "whole", "--json")
     assert code == 0, err
@@ -199,7 +199,7 @@ def test_a_study_through_the_command_line_interrupted_and_not(
 
     recipe = study(
         tmp_path, seeds=[3]
-    )  # now without keeping the runs, and cut in the middle of a cell
+    )  # this time without keeping the runs, and interrupted in the middle of a cell
     for cut in ("tuning/igsp/10/task 2 two", "small/igsp/3/task 3 three"):
 
         def stop(event: Progress, cut: str = cut) -> None:
@@ -210,7 +210,7 @@ def test_a_study_through_the_command_line_interrupted_and_not(
             stage.run(recipe, tmp_path / "cut", stop)
     events: list[Progress] = []
     resumed = stage.run(recipe, tmp_path / "cut", events.append)
-    # From the checkpoint of step 4 on.
+    # From the checkpoint of step 4.
     assert [e.done for e in events if e.stage == "small/igsp/3/task 3 three"] == [4, 5, 6]
     assert timeless(resumed.to_json()) == timeless(table)
     assert {p.name for p in (tmp_path / "cut" / "small").iterdir()} == {"cells.json", "table.json"}
@@ -240,7 +240,7 @@ def test_a_study_through_the_command_line_interrupted_and_not(
 
 @pytest.fixture(scope="module")
 def tuned(tmp_path_factory: pytest.TempPathFactory) -> Any:
-    """What a study of `TUNED_ALONE` that was never interrupted says."""
+    """The result of a study of `TUNED_ALONE` that was never interrupted."""
     folder = tmp_path_factory.mktemp("tuned")
     with pytest.MonkeyPatch.context() as patch:
         offer(patch)
@@ -329,7 +329,7 @@ def test_a_study_cut_anywhere_loses_nothing(
     )
     assert (
         resumed.results[2].value == 10.0 and resumed.results[2].told.last.runs == 2
-    )  # as accurate, and smaller
+    )  # equally accurate, and smaller
 
 
 def changed(name: str, **keys: Any) -> dict[str, Any]:
@@ -341,7 +341,7 @@ def changed(name: str, **keys: Any) -> dict[str, Any]:
     [
         ({}, []),
         ({"keep_runs": True}, []),
-        ({"shared": {**SHARED, "moe_adapters": {"rank": 9}}}, []),  # no learner's of these
+        ({"shared": {**SHARED, "moe_adapters": {"rank": 9}}}, []),  # for none of these learners
         (
             {"seeds": [1, 2]},
             [f"{place}/{name}/2" for place in PLACES for name in VARIANTS if name != "zero-shot"],
@@ -395,7 +395,7 @@ def test_an_interrupted_study_goes_on_after_its_encoder_has_moved(
 ) -> None:
     """The cell has the same key, and its recipe another name.
 
-    So has a tuning run from before recipes named their parts.
+    The same holds for a tuning run from before recipes named their parts.
     """
 
     def stop(event: Progress) -> None:
@@ -475,7 +475,7 @@ def test_a_key_tells_all_that_shapes_a_row_and_nothing_else(tmp_path: Path) -> N
     assert len(keys | {key}) == len(other) + 4
     plain = [
         replace("train", method=name) for name in ("zero-shot", "sequential", "sequential-lora")
-    ]  # they infer nothing
+    ]  # they infer no task
     for shared in plain:
         told = dataclasses.replace(
             shared, inference=dataclasses.replace(shared.inference, rank=3, quantile=0.5)

@@ -1,6 +1,6 @@
-"""`aegis run` with a study: every cell once, in an order that can be cut anywhere.
+"""`aegis run` with a study: every cell once, in an order that can be interrupted anywhere.
 
-All of them end in one comparison.
+All cells end in one comparison.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def bench_calls() -> Iterator[list[list[str]]]:
 def finished(
     small: StudyRecipe, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Path, StudyReport]:
-    """A root folder with the study run once, really trained, and what it reported."""
+    """A root folder with one complete run of the study, really trained, and its report."""
     root = tmp_path_factory.mktemp("studies")
     return root, stage.run(small, root)
 
@@ -89,7 +89,7 @@ def test_a_study_trains_every_cell_and_keeps_no_checkpoints(
 ) -> None:
     folder, report = finished[0] / "small", finished[1]
     assert (report.finished, report.cells) == (7, 7)
-    assert len(files.load_json(folder / "cells.json")) == 7 + 2  # and what two variants' steps cost
+    assert len(files.load_json(folder / "cells.json")) == 7 + 2  # and two variants' step costs
     runs = {str(p.parent.relative_to(folder)) for p in folder.rglob("train.json")}
     assert runs == {*TUNED, *COMPARED}
     assert (
@@ -106,7 +106,7 @@ def test_a_study_trains_every_cell_and_keeps_no_checkpoints(
 def test_a_study_that_is_known_writes_its_table_once(
     small: StudyRecipe, finished: tuple[Path, StudyReport], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Once, after the costs: every earlier table would be of the same cells."""
+    """Once, after the costs: every earlier table would have the same cells."""
     written: list[int] = []
     write_table = stage._write
 
@@ -179,7 +179,7 @@ def test_a_finished_study_is_told_from_its_cells_alone(
     trained: list[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """cells.json on another machine, where the backbone lies elsewhere.
+    """cells.json is on another machine, where the backbone has another path.
 
     Nothing is rendered, loaded or trained.
     """
@@ -209,8 +209,8 @@ def test_overwrite_measures_every_cell_again(
     trained = invent(monkeypatch)
     again = stage.run(small, tmp_path, overwrite=True)
     cells = files.load_json(tmp_path / "small" / "cells.json")
-    # Invented cells have no code. They may choose another value than the measured ones did, whose
-    # cells stay where no other has taken their place.
+    # Invented cells have no code. They may choose another value than the measured cells did, which
+    # are kept unless others have taken their place.
     invented = [cell for cell in cells.values() if cell["code"] is None]
     assert len(trained) == again.cells == len(invented) == finished[1].cells
     assert [task.task for task in again.tasks] == [task.task for task in finished[1].tasks]
@@ -236,7 +236,7 @@ def test_an_interrupted_study_goes_on_to_the_same_table(
     events: list[Progress] = []
     assert without_place(stage.run(small, tmp_path, events.append)) == without_place(finished[1])
     assert trained == COMPARED[1:]
-    # From the checkpoint of step 2 on.
+    # From the checkpoint of step 2.
     assert [e.done for e in events if e.stage == "reach/aegis-update/0/train"] == [2, 3, 4]
 
 
@@ -269,7 +269,7 @@ def test_while_the_knobs_are_tuned_the_table_is_of_the_values_so_far(
 def test_questions_that_cannot_be_used_end_the_study_before_its_first_training(
     part: str, tiny_folder: Path, tmp_path: Path, trained: list[str]
 ) -> None:
-    """Also those of the comparison, which comes when all tuning is done."""
+    """This includes those of the comparison, which comes after all tuning."""
     path, shared = write_jsonl(tmp_path / "vqa"), raw(tiny_folder)["shared"]
     lines = path.read_text().splitlines(keepends=True)
     path.write_text(
@@ -492,7 +492,7 @@ def test_equal_cells_of_two_variants_are_trained_once(
 def test_a_study_without_tuning_has_its_own_tasks_only(
     tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """`demos.drop_below` is of suite tasks: a recipe of any other would be refused."""
+    """`demos.drop_below` is for suite tasks: a recipe with any other task would be refused."""
     labels, task = invent(monkeypatch), "suite/cartpole-balance"
     shared = raw(tiny_folder)["shared"]
     shared["demos"]["drop_below"] = 0.25
@@ -580,9 +580,9 @@ def test_variants_that_train_alike_are_timed_once(
     monkeypatch: pytest.MonkeyPatch,
     bench_calls: list[list[str]],
 ) -> None:
-    """Those that a merge or a learning rate alone tells apart.
+    """Variants that differ only in a merge or a learning rate.
 
-    Another measurement is not put in naive's place.
+    Another measurement does not replace naive's.
     """
     invent(monkeypatch)
     bench_calls.clear()
@@ -728,7 +728,7 @@ def test_cells_from_before_a_column_was_added_are_still_known(
 def test_a_training_that_diverges_is_a_finding(
     tiny_folder: Path, tmp_path: Path, trained: list[str]
 ) -> None:
-    """The study goes on, and knows of it without trying again."""
+    """The study continues, and records the divergence without trying again."""
     variants = {
         "wild": {"method": "naive", "set": {"train.expert_lr": 1e30, "train.warmup": 0}},
         "naive": {"method": "naive"},
@@ -804,7 +804,7 @@ def test_each_set_of_questions_has_a_table_and_a_bar_of_its_own(
     assert {r.variant: r.drop_points.mean for r in second.results} == lost
     assert (second.baseline_accuracy, second.majority_accuracy) == (0.95, 0.5)
     drops = [r.bar.checks[0].passed for t in report.tasks for r in t.results if r.variant == "kept"]
-    assert drops == [True, False]  # stop-gradient loses nothing of the first set here
+    assert drops == [True, False]  # here stop-gradient loses nothing on the first set
     for one, other in zip(first.results, second.results):
         assert one.success_seen == other.success_seen
     assert table.load(tmp_path / "runs" / "small").tasks == report.tasks
@@ -854,7 +854,7 @@ def test_policies_that_cannot_be_rolled_out_are_compared_by_their_open_loop_erro
         for name in ("open_loop_error", "hold_error", "open_loop_difference"):
             del result[name]
         del result["open_loop_over_still"]
-    files.save_json(place / "table.json", older)  # as it was written before there was the figure
+    files.save_json(place / "table.json", older)  # as written before the figure existed
     assert {r.open_loop_error for r in table.load(place).tasks[0].results} == {None}
 
 

@@ -1,4 +1,4 @@
-"""The table of a run or study, read back from its folder: what was written, or one error."""
+"""The table of a run or study, read back from its folder: the written one, or one error."""
 
 from __future__ import annotations
 

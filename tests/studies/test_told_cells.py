@@ -1,4 +1,4 @@
-"""A study's tables from its finished cells alone, by the recipe of their name."""
+"""A study's tables from its finished cells alone, with the recipe that has its name."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_some_cells_have_the_tables_of_what_there_is(tmp_path: Path) -> None:
 def test_no_value_is_chosen_by_another_margin_than_that_of_all_cells(
     missing: str, judged: bool, tmp_path: Path
 ) -> None:
-    """The margin is naive's: without one of its values, the best of all others would set it."""
+    """The margin is naive's: if one of its values is missing, the best of the others sets it."""
     resolved = study_cells.load(RECIPES / "compare.yaml")
     shipped = RECIPES / "results" / "compare.cells.json"
     entries = files.load_json(shipped)

@@ -1,4 +1,4 @@
-"""A study by several processes: the same findings, nothing left running, nothing lost."""
+"""A study by several processes: the same results, nothing left running, nothing lost."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_processes_find_what_one_finds(small: StudyRecipe, tmp_path: Path) -> No
             )
             assert other.validation_loss.mean == pytest.approx(
                 one.validation_loss.mean, rel=1e-4
-            )  # threads add up otherwise
+            )  # threads sum in another order
     assert [e.done for e in events if e.stage == "study"] == [1, 2, 3, 4]
     trained = {e.stage for e in events if e.stage.endswith("/train")}
     assert {

@@ -1,6 +1,6 @@
 """Every stage on a device besides the CPU: nothing is left behind, and no step waits for it.
 
-Where there is no GPU, a stand-in, `samples.second_device`, refuses what a GPU refuses.
+Without a GPU, the stand-in `samples.second_device` refuses what a GPU refuses.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ pytestmark = pytest.mark.skipif(not OTHERS, reason="this torch takes no device o
 ANCHOR, RECIPE = "anchor.safetensors", "recipe.yaml"
 STEPS = 2
 PARTS = "moments,inputs,curvature,fisher"
-# What the task leaves alone moves or not by a weight that has to be known: one wait a step.
+# Whether parameters without a task gradient move depends on a weight: one wait per step to read it.
 WAITS = {"aegis": {"methods/backward.py:combine_gradients": STEPS}}
-# It decides by a sign, which the last bit of a gradient may turn.
+# It decides by a sign, which rounding of a gradient may flip.
 TURNS = "maps"
 OF_HF = ("naive", "aegis", "insulate", "distill", "cotrain")
 
 
 @dataclass(frozen=True)
 class Run:
-    """Commands that ran in a folder; what each said, and where the steps of each waited."""
+    """Commands that ran in a folder; the output of each, and where the steps of each waited."""
 
     folder: Path
     said: dict[str, dict[str, Any]]
@@ -63,7 +63,7 @@ def recipe(backbone: Path) -> Recipe:
 
 
 def commands(backbone: Path, demos: Path, methods: Sequence[str]) -> dict[str, list[str]]:
-    """From the anchor to what is measured of a policy and of a merged one."""
+    """The commands from the anchor to the evaluations of a policy and of a merged one."""
     given = ["--demos", str(demos), "--anchor", ANCHOR]
     found = {"anchor": measuring(backbone, PARTS, ANCHOR)}
     for method in methods:
@@ -85,7 +85,7 @@ def run(folder: Path, jobs: dict[str, list[str]], device: str, kind: str) -> Run
     if device == "cpu":
         with contextlib.chdir(folder):
             found = said(list(jobs.values()))
-    else:  # in a process of its own, since one that has the stand-in keeps it
+    else:  # in a process of its own, since a process that has the stand-in keeps it
         found = processes.alone(said_there, folder, list(jobs.values()), device, kind)
     each = dict(zip(jobs, found, strict=True))
     told = {name: one["said"] for name, one in each.items()}
@@ -99,7 +99,7 @@ def both(
     hf_folder: Callable[[str], Path],
     demos_file: Path,
 ) -> Callable[[str, str], Both]:
-    """What a kind of backbone did on the CPU and on another device, which is done once."""
+    """Results for a kind of backbone on the CPU and on another device; each is made once."""
 
     @cache
     def on(device: str, kind: str) -> Run:
@@ -107,7 +107,7 @@ def both(
         earlier: dict[str, list[str]] = {}
         if kind == "hugging_face":
             backbone, methods = hf_folder("smolvlm"), list(OF_HF)
-            # Another backbone, which was there before, leaves no trace.
+            # An earlier command with another backbone leaves no trace.
             earlier["earlier"] = [
                 *measuring(tiny_folder, "moments", "earlier.safetensors"),
                 "--json",
@@ -132,13 +132,13 @@ def test_anchors_are_the_same(ran: Both) -> None:
     expected, found = (load_file(one.folder / ANCHOR) for one in (ran.cpu, ran.other))
     assert expected.keys() == found.keys()
     for name, tensor in expected.items():
-        if name.endswith(".vectors"):  # few samples leave directions between which rounding chooses
+        if name.endswith(".vectors"):  # with few samples, rounding chooses between some directions
             continue
         torch.testing.assert_close(found[name], tensor, rtol=1e-4, atol=1e-5, msg=name)
 
 
 def test_every_step_is_the_same(ran: Both) -> None:
-    """Losses, norms and distances; not every weight, for Adam moves a bias by rounding alone."""
+    """Losses, norms and distances; not every weight, since Adam moves a bias by rounding alone."""
     for name in ran.cpu.said.keys() & METHODS.keys():
         bound = 2e-2 if name == TURNS else 1e-3
         expected, found = (metrics(one.folder / name, TIMES) for one in (ran.cpu, ran.other))
@@ -162,7 +162,7 @@ def test_what_is_told_is_the_same(ran: Both) -> None:
 @pytest.mark.skipif(not POSSIBLE, reason="the stand-in alone counts")
 @pytest.mark.parametrize("kind", ["embedded", "hugging_face"])
 def test_no_step_waits_for_the_device(kind: str, both: Callable[[str, str], Both]) -> None:
-    """What a model's own code reads is not ours to change."""
+    """Reads in a model's own code are not ours to change."""
     ran = both(NAME, kind)
     for name, places in ran.other.waits.items():
         assert places == WAITS.get(name, {}), name

@@ -1,4 +1,4 @@
-"""Training on augmented frames: resumed to the same bytes, and nothing else is augmented."""
+"""Training on augmented frames: resuming gives the same bytes, and nothing else is augmented."""
 
 from __future__ import annotations
 

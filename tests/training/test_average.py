@@ -1,4 +1,4 @@
-"""The average of the weights: what it is, where it goes, and that training does not notice it."""
+"""The average of the weights: its value, where it is stored, and that training is unchanged."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def averaging(recipe: Recipe) -> Recipe:
 
 
 def state(out: Path, kind: str, at: int | None = None) -> dict[str, Tensor]:
-    """The weights or their average in a checkpoint's training state; of the last one for None."""
+    """The weights or their average in a checkpoint's training state; None: the last checkpoint."""
     folder = checkpoint.last(out) if at is None else out / "checkpoints" / f"{at:06d}"
     saved = artifacts.load(folder / checkpoint.STATE, "training-state").tensors
     return {n.removeprefix(kind): t for n, t in saved.items() if n.startswith(kind)}
@@ -66,7 +66,7 @@ def test_it_is_the_sum_that_its_definition_says(decay: float, waits: list[int], 
         done += waited
         weight.data.copy_(torch.randn(3, 2, generator=generator))
         average.follow(done)
-        average.follow(done)  # the second time changes nothing
+        average.follow(done)  # the second call changes nothing
         kept = min(decay, (1 + done) / (10 + done))
         for _ in range(waited):
             wanted = kept * wanted + (1 - kept) * weight.detach().double()
@@ -81,7 +81,7 @@ def test_a_count_that_nobody_reads_leads_to_the_same_average() -> None:
         for number, done in enumerate(counts, 1):
             weight.data.copy_(number * torch.arange(4.0))
             average.follow(torch.tensor(float(done), dtype=torch.float64) if unread else done)
-        average.follow(7)  # as of a checkpoint
+        average.follow(7)  # as for a checkpoint
         found.append(average.weights["w"])
     torch.testing.assert_close(found[1], found[0])
 
@@ -115,12 +115,12 @@ def test_a_checkpoint_is_the_average_and_training_does_not_notice(
     assert means.keys() <= weights.keys() and state(tmp_path / "plain", "average.") == {}
     policy, _ = checkpoint.load_policy(tmp_path / "average")
     found = dict(policy.named_parameters())
-    for name in means.keys() & found.keys():  # adapters are merged into what they adapt
+    for name in means.keys() & found.keys():  # adapters are merged into the maps that they adapt
         assert torch.equal(found[name], means[name])
     moved = {name for name, mean in means.items() if not torch.equal(mean, weights[name])}
     assert any(name.startswith("expert.") for name in moved)
     assert any(name.startswith("backbone.") for name in moved) == (method != "stop-gradient")
-    # What was measured is what was written.
+    # What was measured was written.
     demos = demonstrations.load(demos_file, SETTINGS.validation_share, averaging.seed)
     noise = train.validation_noise(averaging.seed)
     loss = train.validation_loss(policy, demos, averaging.train, noise)
@@ -139,7 +139,7 @@ def test_it_holds_constrained_weights_alone(
 def test_it_follows_the_last_good_step_of_a_run_that_diverges(
     start: Start, averaging: Recipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Though the method had not constrained that step before it was known to be the last."""
+    """This holds though the method had not constrained that step when it became the last."""
     compute, good = step.compute_gradients, STEPS - 1
 
     def spoiled(*args: Any, index: int, **options: Any) -> step.StepGradients:

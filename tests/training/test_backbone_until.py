@@ -1,4 +1,4 @@
-"""A last phase of training in which the backbone stands still and the expert alone goes on."""
+"""A last phase of training in which the backbone is frozen and only the expert learns."""
 
 from __future__ import annotations
 

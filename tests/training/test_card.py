@@ -1,4 +1,4 @@
-"""The card of a checkpoint's backbone: it names what the weights came about with, and no more."""
+"""The card of a checkpoint's backbone: it names what went into the weights, and nothing else."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`aegis train --dry-run`, and the shipped recipes for Hugging Face models on small stand-ins."""
+"""`aegis train --dry-run`, and the shipped recipes for Hugging Face models on small models."""
 
 from __future__ import annotations
 
@@ -80,8 +80,8 @@ def test_the_shipped_recipes_run_on_small_stand_ins(
         assert code == 0 and json.loads(text)["steps"] == 2, err
         files = (out / "checkpoints" / "000002").rglob("*.safetensors")
         written = sum(t.nbytes for path in files for t in load_file(path).values()) / 1e6
-        # what no gradient reaches (a head that nobody asks, say) has no optimizer state: the plan
-        # is what it takes at most
+        # parameters without a gradient (an unused head, say) have no optimizer state: the plan
+        # is an upper bound
         assert written <= 1.001 * plan["disk_mb"] and (
             method != "stop-gradient" or written >= 0.999 * plan["disk_mb"]
         )
@@ -94,9 +94,9 @@ Plan = Callable[..., dry_run.DryRunReport]
 def plan(
     hf_folder: Made, hf_anchor: Made, demos_file: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> Plan:
-    """The plan of a small Hugging Face model by the method and what is set; made once.
+    """The plan of a small Hugging Face model for the method and the settings; made once.
 
-    Some tests compare the same plans, of which each takes two seconds.
+    Some tests compare the same plans, each of which takes two seconds.
     """
     out = tmp_path_factory.mktemp("plan") / "out"
 
@@ -181,14 +181,14 @@ def test_processes_plan_what_each_of_them_needs(
     weights = 4e-6 * alone.parameters
     for way, planned in plans.items():
         first, second = (json.loads((planned.said / f"{k}.json").read_text()) for k in (0, 1))
-        # Of this process's own clock, and moment.
+        # These depend on the process's own clock and moment.
         ours = ("step_s", "validation_s", "hours", "memory_free_mb")
         assert [k for k in first if first[k] != second[k] and k not in ours] == []
         assert (first["processes"], first["memory_fits"]) == (2, True)
         assert first["memory_together_mb"] > first["memory_measured_mb"] > 0 < first["hours"]
         used = first["memory_mb"]
         assert used["activations"] == pytest.approx(alone.memory_mb["activations"] / 2, rel=0.2)
-        # Of its rows, and in the first process the whole weights that it writes.
+        # Its own rows, and in the first process also the whole weights that it writes.
         share = 1.5 if way == "fsdp" else 1
         assert used["weights"] == pytest.approx(share * weights, rel=0.02)
         share = 0.5 if way == "fsdp" else 1
@@ -197,7 +197,7 @@ def test_processes_plan_what_each_of_them_needs(
         assert first["disk_mb"] == pytest.approx(alone.disk_mb)
         assert first["groups"] == alone.groups and first["parameters"] == alone.parameters
         assert first["validation_s"].keys() == {"loss"}
-    # The first process asks, acts and predicts, and what it found is what all others tell.
+    # Only the first process asks, acts and predicts, and the others report what it found.
     for each in watching:
         first, second = (json.loads((each.said / f"{k}.json").read_text()) for k in (0, 1))
         found = first["validation_s"]
@@ -210,7 +210,7 @@ def test_processes_plan_what_each_of_them_needs(
 def test_what_is_free_is_asked_before_the_dry_run_takes_some(
     tiny_folder: Path, demos_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Else the weights would count twice: in the plan, and in what is missing."""
+    """Otherwise the weights would count twice: in the plan, and in the missing memory."""
     order: list[str] = []
     build, free = dry_run.assemble.build, dry_run.memory.free
     monkeypatch.setattr(
@@ -234,7 +234,7 @@ def test_a_dry_run_tells_the_steps_that_it_takes(
 def test_a_dry_run_tells_what_it_does_before_its_first_step(
     tiny_folder: Path, demos_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """In a pipe nothing else would: a large model takes minutes to load, and to pass a frame."""
+    """In a pipe nothing else would be printed: a large model takes minutes to load and run once."""
     told: list[str] = []
 
     def noted(stage: Callable[..., Any], name: str) -> Callable[..., Any]:
@@ -259,7 +259,7 @@ def test_a_dry_run_tells_what_it_does_before_its_first_step(
 
 
 def seconds(plan: DryRunReport, steps: int, validations: int) -> float:
-    """How long so much takes by what a plan has measured."""
+    """How long this many steps and validations take according to a plan."""
     assert plan.step_s is not None and plan.step_s > 0 and plan.validation_s is not None
     assert plan.validation_s.keys() == {"loss"} and plan.validation_s["loss"] > 0
     return steps * plan.step_s + validations * plan.validation_s["loss"]
@@ -332,7 +332,7 @@ def test_what_a_pass_keeps_is_gone_before_the_steps_are_measured(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """An operation that saves its own result would hold its graph for good."""
+    """An operation that saves its own result would keep its graph alive forever."""
     passed, left = dry_run.pass_kept, []
 
     def alive() -> int:
@@ -356,7 +356,7 @@ def test_rounded_weights_count_once_and_not_for_each_frame(plan: Plan) -> None:
         given = {} if precision == "float32" else {"precision": precision}
         four, eight = plan("naive", **given), plan("naive", batch_size=8, **given)
         fixed[precision] = 2 * four.memory_mb["activations"] - eight.memory_mb["activations"]
-    # Maps, with two bytes a number; tables and norms stay as they are.
+    # Maps, at two bytes per number; tables and norms stay float32.
     rounded = fixed["bf16"] - fixed["float32"]
     assert 1e-6 * four.trainable < rounded < 2e-6 * four.trainable
 
@@ -518,7 +518,7 @@ def test_a_dry_run_of_the_embedded_backbone(
 
 
 def test_modules_under_an_unused_name_are_not_kept() -> None:
-    """Disk is counted once for a weight with two names."""
+    """Disk space is counted once for a weight with two names."""
     module = nn.ModuleDict({"a": nn.Linear(2, 2, bias=False)})
     module["b"] = module["a"]
     assert dry_run._bytes(dry_run._tensors(module)) == 16

@@ -1,4 +1,4 @@
-"""AdamW's moments in 8 bits: near AdamW, resumed to the same bytes, counted and refused."""
+"""AdamW's moments in 8 bits: close to AdamW, resumed to the same bytes, counted and refused."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ installed = pytest.mark.skipif(
 
 
 def parameters(seed: int = 0) -> dict[str, nn.Parameter]:
-    """One that is large enough for codes, with a last block that is not full, and a small one."""
+    """A parameter large enough for codes, with an incomplete last block, and a small one."""
     generator = torch.Generator().manual_seed(seed)
     shapes = {"large": (90, 50), "small": (7,), "idle": (3,)}
     return {n: nn.Parameter(torch.randn(shape, generator=generator)) for n, shape in shapes.items()}

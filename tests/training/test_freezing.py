@@ -1,4 +1,4 @@
-"""`train.freeze`: what it names stands still under every method, and costs nothing."""
+"""`train.freeze`: what it names stays frozen under every method, and costs nothing."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ MOVES = "layers.1.qkv.weight"  # under every method that trains the backbone
 
 
 def heard() -> tuple[list[str], Callable[[Event], None]]:
-    """The texts of warnings, and the listener that hears them."""
+    """The texts of warnings, and the listener that collects them."""
     texts: list[str] = []
 
     def listen(event: Event) -> None:
@@ -58,14 +58,14 @@ def heard() -> tuple[list[str], Callable[[Event], None]]:
 
 
 def frozen(backbone: Backbone, freeze: str | Sequence[str], method: str = "naive") -> list[str]:
-    """Freeze parts of a backbone under a method; the names of what does not learn."""
+    """Freeze parts of a backbone under a method; returns the names of what is frozen."""
     chosen = METHODS[method]
     freezing.adapt(chosen, backbone, options_of(chosen), freeze, heard()[1])
     return [name for name, p in backbone.named_parameters() if not p.requires_grad]
 
 
 def below(backbone: Backbone, *parts: str) -> list[str]:
-    """Names of the parameters in some parts of a backbone."""
+    """Names of the parameters in parts of a backbone."""
     starts = tuple(f"{part}." for part in parts)
     return [name for name, _ in backbone.named_parameters() if f"{name}.".startswith(starts)]
 
@@ -138,7 +138,7 @@ def test_a_run_does_not_go_on_with_other_parts_frozen(
 def test_updates_are_projected_where_everything_is_optional(
     start: Start, recipe: Recipe, tmp_path: Path, tiny_folder: Path
 ) -> None:
-    """AEGIS on the applied update, with shared anchor gradients, of a part of the batch."""
+    """AEGIS on the applied update, with anchor gradients shared, from part of the batch."""
     options = Aegis(projects="both", restoration=0.1, refresh=2, fraction=0.5)
     chosen = replace(changed(recipe, freeze=PARTS), aegis=options)
     start("aegis", tmp_path, recipe=chosen)
@@ -166,7 +166,7 @@ def _with_frozen(method: str, freeze: str | Sequence[str]) -> Policy:
 @pytest.mark.parametrize("method", ["naive", "aegis", "distill", "maps"])
 @pytest.mark.parametrize("part", ["stem", "layers.0", "layers.1"])
 def test_the_rest_gets_the_gradient_that_it_gets_beside_what_learns(method: str, part: str) -> None:
-    """A frozen layer's activations count as before, in the loss and in the transport cost."""
+    """A frozen layer's activations count as before in the loss and in the transport cost."""
     whole, less = _with_frozen(method, ()), _with_frozen(method, part)
     row, same = gradients(whole, METHODS[method]).row, gradients(less, METHODS[method]).row
     wanted = dict(whole.named_parameters())
@@ -432,7 +432,7 @@ def test_what_distill_shares_with_its_teacher_is_what_it_would_have_copied() -> 
         backbone = policy.backbone
         freezing.adapt(chosen, backbone, options_of(chosen), ("stem", "layers.0"), heard()[1])
         if not shares:
-            backbone.requires_grad_(True)  # so that all is copied
+            backbone.requires_grad_(True)  # so that everything is copied
         policy.parts = chosen.start(  # type: ignore[assignment]
             MethodContext(backbone, backbone.learning_groups(), {}, options_of(chosen))
         )

@@ -1,4 +1,4 @@
-"""A long training keeps no more than its ledger."""
+"""A long training keeps nothing but its ledger."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from samples import processes
 
 
 def test_memory_does_not_grow_with_the_steps(tmp_path: Path) -> None:
-    """The ledger of 300 steps is 60 KB; a step that kept its batch would show as 100 KB each."""
+    """The ledger of 300 steps is 60 KB; keeping a step's batch would add 100 KB each."""
     found, ledger = processes.alone(growth.measure, tmp_path, 300, 3)
     sizes = list(found.values())
     assert len(sizes) == 3 and ledger < 100_000

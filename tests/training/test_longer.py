@@ -1,4 +1,4 @@
-"""A run that is trained longer, and one that begins with another's expert."""
+"""A run that is trained for longer, and one that starts with another run's expert."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ LONGER = STEPS + 4
 
 
 def of(recipe: Recipe, **changes: object) -> Recipe:
-    """The recipe with other keys of `train`."""
+    """The recipe with changed keys of `train`."""
     return replace(recipe, train=replace(recipe.train, **changes))
 
 
@@ -40,7 +40,7 @@ def of(recipe: Recipe, **changes: object) -> Recipe:
 def test_a_longer_run_ends_in_the_bytes_of_one_planned_so(
     method: str, schedule: str, recipe: Recipe, start: Start, tmp_path: Path
 ) -> None:
-    """Also where the added steps are interrupted, and where it is made longer twice."""
+    """This holds if the added steps are interrupted, and if it is made longer twice."""
     recipe = of(recipe, schedule=schedule)
     twice = of(recipe, steps=LONGER + 3)
     start(method, tmp_path / "grown", recipe=recipe)
@@ -130,7 +130,7 @@ def test_what_is_not_made_longer(
 
 
 def beginning_with(recipe: Recipe, run: Path, **changes: object) -> Recipe:
-    """The recipe of a run that begins with another's backbone and expert."""
+    """The recipe of a run that starts with another run's backbone and expert."""
     expert = replace(recipe.expert, start=str(run), **changes)
     return replace(recipe, backbone=str(run), expert=expert)
 
@@ -146,7 +146,7 @@ def test_a_run_begins_with_anothers_policy(
         torch.testing.assert_close(here.state_dict()[name], tensor)
     header = artifacts.read_header(checkpoint.last(tmp_path / "again") / checkpoint.EXPERT)
     assert header.inputs["expert"] == checkpoint.expert_sha256(naive_run)
-    # Resuming asks for the same expert.
+    # Resuming requires the same expert.
     start("naive", tmp_path / "again", recipe=still, anchor=None, resume=True)
 
 

@@ -1,4 +1,4 @@
-"""Float32 masters of weights that passes see in bfloat16: exact steps, and a run of each method."""
+"""Float32 masters of weights used in bfloat16: exact steps, and a run of each method."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ FAMILY = "smolvlm"
 
 @pytest.fixture(scope="module")
 def anchor(tmp_path_factory: pytest.TempPathFactory, hf_folder: Made) -> Path:
-    """Every part of an anchor."""
+    """An anchor with every part."""
     path = tmp_path_factory.mktemp("anchor") / "anchor.safetensors"
     settings = Anchor(samples=14, batch_size=14, energy=1.0, parts=ANCHOR_PARTS, fisher_samples=4)
     measure.run(str(hf_folder(FAMILY)), settings, path)
@@ -80,7 +80,7 @@ def test_a_pass_sees_rounded_weights_and_the_masters_stay() -> None:
 
 
 def test_gradients_of_several_passes_are_added_up_in_float32() -> None:
-    """One that is 1,000 times smaller than the first would be lost in bfloat16."""
+    """A gradient 1,000 times smaller than the first would be lost in bfloat16."""
     weight, idle = two_weights()
     masters = Masters([weight, idle])
     for scale in (1.0, 0.001):
@@ -101,7 +101,7 @@ def test_the_masters_are_back_after_an_error() -> None:
 
 
 def test_steps_smaller_than_half_a_neighbours_distance_move_the_weights() -> None:
-    """Near 1 the next bfloat16 is 2^-8 below: a hundred steps of 1e-4 are lost, or are 0.01."""
+    """Near 1 the next bfloat16 is 2^-8 below: a hundred steps of 1e-4 are lost, or sum to 0.01."""
 
     def moved(weight: nn.Parameter, masters: Masters) -> float:
         optimizer = torch.optim.AdamW([weight], lr=1e-4, weight_decay=0.0)
@@ -126,7 +126,7 @@ def test_what_does_not_learn_is_rounded_for_good() -> None:
 
 
 def test_a_copy_that_teaches_is_rounded_like_its_student(hf_backbone: Loaded) -> None:
-    """The distance from it is 0 at first, and would else be that of the rounding."""
+    """The distance to it starts at 0; otherwise it would start at the rounding error."""
     backbone, method = hf_backbone(FAMILY), METHODS["distill"]
     own = list(backbone.parameters())
     method.adapt(backbone, backbone.language_maps(), options_of(method))
@@ -144,7 +144,7 @@ def test_a_copy_that_teaches_is_rounded_like_its_student(hf_backbone: Loaded) ->
 # --- runs -----------------------------------------------------------------------------------------
 
 
-# Those that keep weights of their own beside the masters, constrain these, or learn others.
+# Methods that keep weights beside the masters, constrain the masters, or train others.
 RESUMED = ("naive", "distill", "ewc", "kfac", "lora", "nullspace")
 
 
@@ -152,7 +152,7 @@ RESUMED = ("naive", "distill", "ewc", "kfac", "lora", "nullspace")
 def test_every_method_trains_and_a_resumed_run_ends_in_the_same_bytes(
     method: str, hf_folder: Made, anchor: Path, demos_file: Path, tmp_path: Path
 ) -> None:
-    """A run of any method goes on from float32 weights in `test_train_resume`."""
+    """For float32 weights, resuming is tested for each method in `test_train_resume`."""
     settings, given = recipe(hf_folder(FAMILY)), (method, demos_file, anchor)
     train.run(settings, *given, tmp_path / "run")
     if method in RESUMED:
@@ -161,7 +161,7 @@ def test_every_method_trains_and_a_resumed_run_ends_in_the_same_bytes(
             train.run(settings, *given, cut, on_event=stop_at(3, KeyboardInterrupt()))
         train.run(settings, *given, cut, resume=True)
         assert_same_run(tmp_path / "run", cut)
-    # What learns is float32 in the training state, and moves.
+    # Trainable weights are float32 in the training state, and move.
     first, *_, last = states(tmp_path / "run")
     moved = {n for n, t in first.tensors.items() if not torch.equal(t, last.tensors[n])}
     weights = {n for n in moved if n.startswith("weight.backbone.")}
@@ -180,7 +180,7 @@ def test_what_nullspace_applies_to_the_masters_is_orthogonal_to_the_protected_sp
 
 
 def by_hand(policy: Policy, batch: RobotBatch, steps: int) -> dict[str, Tensor]:
-    """AdamW on float32 copies of the weights, of which a pass reads the rounded values."""
+    """AdamW on float32 copies of the weights, of which the passes read the rounded values."""
     learning = {name: p for name, p in policy.named_parameters() if p.requires_grad}
     wide = {name: p.detach().clone() for name, p in learning.items()}
     optimizer = torch.optim.AdamW(wide.values(), lr=1e-3, fused=True)
@@ -256,7 +256,7 @@ def test_a_checkpoint_has_the_masters_and_resuming_refuses_rounded_ones(
 def test_low_rank_terms_are_merged_into_wide_weights(
     hf_folder: Made, demos_file: Path, tmp_path: Path
 ) -> None:
-    """What they add is not rounded, although the weights that they are added to have been."""
+    """What they add is not rounded, although the weights to which it is added have been."""
     train.run(recipe(hf_folder(FAMILY), steps=2), "lora", demos_file, None, tmp_path / "run")
     merged = backbones.load(str(tmp_path / "run")).language_maps()
     (state,) = states(tmp_path / "run")
@@ -269,7 +269,7 @@ def test_low_rank_terms_are_merged_into_wide_weights(
         torch.testing.assert_close(linear.weight, base.float() + 2 * high @ low)  # alpha / rank
         if not torch.equal(linear.weight, linear.weight.bfloat16().float()):
             wide.add(name)
-        assert (name in wide) is bool(high.any())  # no gradient reaches some
+        assert (name in wide) is bool(high.any())  # some get no gradient
     assert wide
 
 

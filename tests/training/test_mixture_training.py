@@ -1,4 +1,4 @@
-"""A training on several sets of demonstrations: what it learns, records, and refuses."""
+"""Training on several sets of demonstrations: what it learns, records, and refuses."""
 
 from __future__ import annotations
 
@@ -59,14 +59,14 @@ def run(
     sets: tuple[Path, Path],
     tmp_path_factory: pytest.TempPathFactory,
 ) -> Path:
-    """A run on both, two of three frames from the first; read only."""
+    """A run on both, with two of three frames from the first; read-only."""
     out = tmp_path_factory.mktemp("run") / "mixed"
     start("naive", out, recipe=mixed(recipe, sets, weights=(2.0, 1.0)), demos=sets)
     return out
 
 
 def weights(out: Path) -> dict[str, torch.Tensor]:
-    """What a run has learned."""
+    """The weights that a run has learned."""
     last = out / "checkpoints" / "last"
     found = load_file(last / "expert.safetensors")
     return found | load_file(last / "backbone" / "model.safetensors")
@@ -80,7 +80,7 @@ def assert_same_training(one: Path, other: Path) -> None:
 
 
 def seed_of_one_split(share: float) -> int:
-    """A seed by which the halves hold out the episodes that the whole does."""
+    """A seed with which the halves hold out the same episodes as the whole file."""
     middle = EPISODES // 2
 
     def agrees(seed: int) -> bool:
@@ -206,7 +206,7 @@ def test_a_dry_run_tells_what_is_seen_of_each_set(
     assert found[0]["share"] == pytest.approx(2 / 3, abs=1 / plan.training_frames)
     seen = sum(own["training_frames"] * own["epochs"] for own in found)
     assert seen == pytest.approx(SETTINGS.steps * SETTINGS.batch_size)
-    assert plan.memory_mb["method"] == 0  # frames are nobody's memory
+    assert plan.memory_mb["method"] == 0  # no frame counts as memory
     assert dry_run.run(recipe, "naive", demos_file, None, tmp_path / "x").sets is None
 
 
@@ -261,7 +261,7 @@ def test_the_command_takes_several_sets(
     assert json.loads(text)["steps"] == 1
     kept = recipes.load(tmp_path / "x" / "recipe.yaml").demos
     assert (kept.path, kept.weights) == (tuple(map(str, sets)), (1.0, 3.0))
-    # The recipe that the run keeps names them by itself.
+    # The recipe in the run folder names them too.
     again = ("train", tmp_path / "x" / "recipe.yaml", "--out", tmp_path / "y", "--json")
     code, _, err = aegis(*again)
     assert code == 0, err

@@ -1,7 +1,7 @@
-"""A run folder that commit 2e38d13 wrote and was interrupted in: today's code reads it and goes on.
+"""A run folder that commit 2e38d13 wrote until an interruption: today's code can resume it.
 
 The folder holds two of four steps of `aegis` on the untrained two-layer VLM, with the model, the
-demonstrations and the anchor that it was begun with.
+demonstrations and the anchor of the run.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ import pytest
 Aegis = Callable[..., tuple[int, str, str]]
 
 OLD = Path(__file__).parent.parent / "samples" / "old_runs" / "policy-2e38d13"
-# What 2e38d13 itself reached when it went on, on another processor: losses of steps 1 to 4.
+# The results of 2e38d13 itself when it resumed, on another processor: losses of steps 1 to 4.
 LOSSES = [2.531140089035034, 3.1994669437408447, 2.390641927719116, 2.4156343936920166]
-# and the W2^2 of its two layers when the finished run was probed on 14 questions
+# and the W2^2 of its two layers in a probe of the finished run with 14 questions
 DRIFT = [0.5159394422116477, 0.15827987701673263]
 
 

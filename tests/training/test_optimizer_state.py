@@ -1,4 +1,4 @@
-"""An optimizer's state as named tensors: taken, put back, and continued."""
+"""An optimizer's state as named tensors: read out, put back, and continued."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def parameters(seed: int = 0) -> dict[str, nn.Parameter]:
 
 
 def optimizers(named: dict[str, nn.Parameter]) -> list[torch.optim.Optimizer]:
-    """Two of different kinds, as pre-training has them."""
+    """Two optimizers of different kinds, as in pre-training."""
     return [
         torch.optim.AdamW([named["a.weight"], named["never.used"]], lr=0.1, fused=True),
         torch.optim.SGD([named["b"]], lr=0.1, momentum=0.9),
@@ -97,7 +97,7 @@ def put(name: str, value: Tensor) -> Callable[[Saved], object]:
 def test_a_tensor_that_does_not_fit_is_refused_before_any_is_put_back(
     change: Callable[[Saved], object], found: str
 ) -> None:
-    """A fused optimizer writes as far as its parameter goes, whatever the size of its state."""
+    """A fused optimizer writes to its parameter's full size, whatever the size of its state."""
     named = parameters()
     train(named, made := optimizers(named), range(2))
     saved = {name: t.clone() for name, t in optimizer_state.to_tensors(named, made).items()}
@@ -125,7 +125,7 @@ def test_a_file_that_does_not_say_what_has_no_state_has_one_at_least() -> None:
 
 @pytest.mark.parametrize(("fused", "place"), [(True, "meta"), (False, "cpu")])
 def test_step_counts_lie_where_their_optimizer_reads_them(fused: bool, place: str) -> None:
-    """As PyTorch's own `load_state_dict` places them; 'meta' stands for a GPU."""
+    """They are where PyTorch's own `load_state_dict` puts them; 'meta' stands for a GPU."""
     parameter = nn.Parameter(torch.zeros(2, device="meta"))
     optimizer = torch.optim.AdamW([parameter])
     optimizer.param_groups[0]["fused"] = fused

@@ -1,4 +1,4 @@
-"""SGD for the backbone, under every method; that naive's is PyTorch's, test_train.py shows."""
+"""SGD for the backbone under every method; test_train.py shows that naive's is PyTorch's."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ __all__ = ["recipe", "start"]  # fixtures
 SGD = replace(SETTINGS, optimizer="sgd", backbone_lr=0.05, betas=(0.8, 0.95))
 
 
-# One of each way in which a method meets the optimizer: plain, a second backward pass, adapters, an
-# auxiliary loss, and updates that are projected or preconditioned over several steps. That each
-# method goes on from a checkpoint is tested with AdamW, in `test_train_resume`.
+# One of each way in which a method uses the optimizer: plain, a second backward pass, adapters,
+# an auxiliary loss, and updates that are projected or preconditioned over several steps. Resuming
+# each method from a checkpoint is tested with AdamW in `test_train_resume`.
 @pytest.mark.parametrize("method", ["naive", "aegis", "lora", "ewc", "kfac", "nullspace"])
 def test_a_resumed_run_with_sgd_ends_in_the_same_bytes(
     start: Start, recipe: Recipe, tmp_path: Path, method: str
@@ -39,7 +39,7 @@ def test_a_resumed_run_with_sgd_ends_in_the_same_bytes(
 def test_the_applied_update_is_constrained_as_adamws_is(
     start: Start, recipe: Recipe, anchor_file: Path, tmp_path: Path
 ) -> None:
-    """`nullspace` projects what SGD applies, its momentum and weight decay included."""
+    """`nullspace` projects SGD's applied update, including its momentum and weight decay."""
     shared = replace(SGD, weight_decay=0.5)
     guarded = replace(recipe.nullspace, energy=0.9, every=1)
     slow = replace(recipe, train=shared, nullspace=guarded)
@@ -71,7 +71,7 @@ def test_a_dry_run_counts_one_moment_instead_of_two(
 def test_a_rate_per_parameter_gives_sgd_a_group_for_each(
     recipe: Recipe, demos_file: Path, anchor_file: Path, tmp_path: Path
 ) -> None:
-    """So that kfac's `balance` scales SGD's steps too."""
+    """This lets kfac's `balance` scale SGD's steps too."""
     chosen = replace(recipe, train=replace(SGD, method="kfac"))
     made = assemble.build(chosen, METHODS["kfac"], demos_file, anchor_file, tmp_path, print)
     backbone, expert = made.optimizers

@@ -1,4 +1,4 @@
-"""Several processes train what one trains, whatever their number and whatever the method."""
+"""Several processes train like a single one, for any number of them and every method."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from aegis_cli.training.train import LEDGER
 
 Make = Callable[..., Job]
 BATCH, STEPS, SAVED = 8, 4, 2  # three processes have 2, 3 and 3 frames of a batch
-SHORT = {"steps": SAVED}  # where it is enough that steps follow one another to one checkpoint
+SHORT = {"steps": SAVED}  # if it is enough to take steps up to the first checkpoint
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +55,7 @@ def make(recipe: Recipe, demos_file: Path, anchor_file: Path) -> Make:
 
 
 def assert_same_training(one: Path, other: Path) -> None:
-    """Losses and the ledger agree as far as rounding lets them."""
+    """Losses and the ledger agree up to rounding."""
     for here, there in zip(metrics(one, TIMES), metrics(other, TIMES), strict=True):
         assert here == pytest.approx(there, rel=1e-5, abs=1e-7)
     rows, its = (artifacts.load(run / LEDGER, "ledger").tensors for run in (one, other))
@@ -64,7 +64,7 @@ def assert_same_training(one: Path, other: Path) -> None:
         torch.testing.assert_close(values, its[name], rtol=1e-4, atol=1e-9)
 
 
-# Together they take every way: a second backward pass, losses of their own, constrained updates.
+# Together they use every feature: a second backward pass, their own losses, constrained updates.
 OF_THREE = (
     ("ddp", "aegis"),
     ("ddp", "distill"),
@@ -78,10 +78,10 @@ OF_TWO_IN_BF16 = (("ddp", "aegis"), ("fsdp", "aegis"), ("fsdp", "nullspace"), ("
 
 
 def watched(job: Job) -> Job:
-    """The same training, which is asked, acts and predicts with every validation loss.
+    """The same training, which asks, acts and predicts with every validation loss.
 
-    Three processes ask 2, 2 and 3 of the questions, where each has whole weights. The first one
-    alone acts and predicts. Whole chunks are executed, so that an episode takes few predictions.
+    Three processes ask 2, 2 and 3 of the questions if each has whole weights. Only the first one
+    acts and predicts. Whole chunks are executed, so an episode takes few predictions.
     """
     recipe = job.recipe
     watching = replace(
@@ -109,7 +109,7 @@ def shared_runs(
 ) -> dict[object, Any]:
     """Trainings by three processes and by two, and one that three began and two finished.
 
-    To start processes takes longer than what they do, so that they do all of it.
+    Starting the processes takes longer than their work, so they do all of it.
     """
     out = tmp_path_factory.mktemp("shared")
     three, two = (
@@ -121,7 +121,7 @@ def shared_runs(
         three[key] = watched(three[key])
     begun = make("aegis", out / "begun", parallel="fsdp", **changes)
     ended = make("aegis", out / "begun", parallel="ddp", **changes)
-    # Its expert reads the last layer's keys and values past that layer's output.
+    # Its expert also reads the last layer's keys and values, besides that layer's output.
     two["fsdp", "hf"] = watched(hugging_face)
     average = make("nullspace", out / "average", parallel="fsdp", ema_decay=0.6)
     two["fsdp", "nullspace", "average"] = watched(average)
@@ -143,7 +143,7 @@ def shared_runs(
     for way in ("ddp", "fsdp"):
         job = make("naive", out / f"averaging-{way}", parallel=way, **SHORT)
         two[way, "averaging"] = Averaging(**vars(replace(job, anchor=None)))
-    # The others notice it, and may be the first that are noticed.
+    # The others notice that it is gone, and one of them may be reported first.
     gone = (multiprocessing.ProcessExitedException, multiprocessing.ProcessRaisedException)
     with pytest.raises(gone):
         run_together(3, [*three.values(), replace(begun, killed_after=SAVED + 1)])
@@ -191,7 +191,7 @@ def test_parts_that_are_frozen_stay_so_in_every_process(
 def test_processes_train_in_bf16_what_one_trains(
     shared_runs: dict[object, Any], tmp_path: Path, key: tuple[str, str]
 ) -> None:
-    """Up to that rounding: each process rounds the gradient of its own frames."""
+    """They agree up to rounding: each process rounds the gradient of its own frames."""
     job = shared_runs[2, *key, "bf16"]
     alone = replace(job, out=tmp_path / "alone")
     alone.run()
@@ -209,7 +209,7 @@ def test_processes_train_in_bf16_what_one_trains(
 def test_weights_gathered_in_bf16_are_those_that_autocast_makes(
     shared_runs: dict[object, Any],
 ) -> None:
-    """Sharded or whole: the same products, the same float32 norms, the same sums."""
+    """Sharded or not: the same products, the same float32 norms, the same sums."""
     whole, sharded = (shared_runs[2, way, "aegis", "bf16"].out for way in ("ddp", "fsdp"))
     assert_same_training(sharded, whole)
 
@@ -227,7 +227,7 @@ def test_only_what_enters_products_is_gathered_in_bf16(tiny_folder: Path) -> Non
 
 
 def test_what_three_began_two_finish(shared_runs: dict[object, Any], tmp_path: Path) -> None:
-    """Also where weights were sharded before, and are whole after."""
+    """This includes weights that were sharded before the interruption and are whole after it."""
     job = shared_runs["resumed"]
     alone = replace(job, out=tmp_path / "alone")
     alone.run()
@@ -258,8 +258,8 @@ def test_batch_normalisations_average_the_frames_of_all_processes(
     job = shared_runs[2, way, "averaging"]
     alone = replace(job, out=tmp_path / "alone")
     alone.run()
-    # Half of a batch each, so that the mean of both averages is that of one process, up to how
-    # PyTorch rounds a sum over so many pixels. What one of the two has averaged is a fifth off.
+    # Each has half of a batch, so the mean of both averages equals that of one process, up to
+    # PyTorch's rounding of a sum over so many pixels. The average of one of the two is a fifth off.
     both, one = (artifacts.load(checkpoint.last(j.out) / checkpoint.STATE) for j in (job, alone))
     mean = "buffer.backbone.stem.norm.running_mean"
     torch.testing.assert_close(both.tensors[mean], one.tensors[mean], rtol=1e-3, atol=0)
@@ -277,7 +277,7 @@ def test_two_processes_measure_what_one_measures(
     assert here.header.meta == there.header.meta and here.tensors.keys() == there.tensors.keys()
     for name, values in here.tensors.items():
         other = there.tensors[name]
-        if name.endswith(".values"):  # the least of them are rounding
+        if name.endswith(".values"):  # the smallest are only rounding
             assert (values - other).abs().max() <= 1e-5 * other.abs().max(), name
         elif not name.endswith(".vectors"):  # which have no sign
             torch.testing.assert_close(values, other, rtol=1e-5, atol=1e-7)
@@ -322,7 +322,7 @@ def test_one_process_of_a_machine_decodes_and_the_others_find_the_frames(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Which also decides whether the disk has room for them: two might find otherwise."""
+    """It also decides whether the disk has room for them: two might decide differently."""
     order: list[str] = []
     load = loading.load_demonstrations
 
@@ -345,7 +345,7 @@ def test_all_wait_until_a_checkpoint_is_written(
     job, written = make("naive", tmp_path / "run"), []
     monkeypatch.setattr(Ranks, "wait", lambda _: written.append(len(checkpoint.whole(job.out))))
     job.run()
-    # The first waits for the frames.
+    # The first process waits for the frames.
     assert written == list(range(len(checkpoint.whole(job.out)) + 1))
 
 
@@ -393,7 +393,7 @@ def test_a_part_of_each_share_is_no_part_of_the_batch(make: Make, tmp_path: Path
 
 
 def test_pytorch_finds_every_tensor_of_an_encoding() -> None:
-    """By them it gathers sharded weights for the backward pass; before 2.13 it has to be told."""
+    """FSDP uses them to gather sharded weights for backward; before 2.13 it has to be told them."""
     parallel._tell_of_encodings()
     tensors = [torch.full((1,), float(i)) for i in range(5)]
     hidden, key, value, mask, image = tensors

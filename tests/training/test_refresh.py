@@ -27,7 +27,7 @@ from aegis_cli.training import checkpoint, dry_run, step
 
 __all__ = ["recipe", "start"]  # fixtures
 
-SHARED = 4  # steps; longer than between two checkpoints, so that one lies inside
+SHARED = 4  # steps; more than between two checkpoints, so one checkpoint falls inside
 
 
 def refreshed(recipe: Recipe, every: int, **options: Any) -> Recipe:

@@ -1,4 +1,4 @@
-"""A training on demonstrations of other names: what it records, and who else knows the names."""
+"""Training on demonstrations with other names: what it records, and where the names are known."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ pytestmark = pytest.mark.usefixtures("frame_cache")
 
 @pytest.fixture(scope="module")
 def sets(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """A dataset of `reach`, and another one whose camera and an action have other names."""
+    """A dataset of `reach`, and another one whose camera and one action have other names."""
     folder = tmp_path_factory.mktemp("sets")
     for name, seed in (("own", 0), ("plain", 1)):
         record.run("reach", 4, seed, folder / name, workers=1, form="lerobot")
@@ -53,7 +53,7 @@ def renaming(recipe: Recipe, **demos: Any) -> Recipe:
 def run(
     recipe: Recipe, start: Start, sets: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory
 ) -> Path:
-    """A run on both; read only."""
+    """A run on both; read-only."""
     out = tmp_path_factory.mktemp("run") / "both"
     start("naive", out, recipe=renaming(recipe), demos=sets)
     return out
@@ -62,7 +62,7 @@ def run(
 def test_the_weights_and_losses_are_those_of_sets_of_one_name(
     run: Path, recipe: Recipe, start: Start, sets: tuple[Path, Path], tmp_path: Path
 ) -> None:
-    """The validation loss among them."""
+    """This includes the validation loss."""
     start("naive", tmp_path / "plain", demos=(sets[0], sets[1].parent / "plain"))
     for name in ("expert.safetensors", "backbone/model.safetensors"):
         one, other = (
@@ -75,7 +75,7 @@ def test_the_weights_and_losses_are_those_of_sets_of_one_name(
 
 
 def test_the_policy_has_its_own_names(run: Path, tmp_path: Path) -> None:
-    """Also after an export, whose pictures LeRobot knows by them."""
+    """This includes an export, by whose names LeRobot finds the pictures."""
     export.run(run, tmp_path / "lerobot")
     for folder in (run, tmp_path / "lerobot"):
         policy = load_policy(folder)
@@ -141,7 +141,7 @@ def test_each_set_is_evaluated_under_the_policys_names(
 def test_other_data_of_yet_other_names_is_evaluated_by_an_option(
     run: Path, sets: tuple[Path, Path], aegis: Aegis, tmp_path: Path
 ) -> None:
-    """Of a run, and of a policy without one; without it, a warning of each says that there is."""
+    """For a run, and for a policy without one; without the option, each gives a warning of it."""
     data = otherwise(sets[0], tmp_path / "new", {TOP: "observation.images.cam", "dy": "other"})
     export.run(run, tmp_path / "policy")
     for policy in (run, tmp_path / "policy"):

@@ -1,4 +1,4 @@
-"""`train.keep_checkpoints`: the last ones and the best one stay, and at no time is there none."""
+"""`train.keep_checkpoints`: the last ones and the best one stay; there is always at least one."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def steps_in(run: Path) -> list[int]:
 
 @pytest.fixture
 def losses(monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[int, float]]:
-    """Validation losses by step, in place of measured ones."""
+    """Validation losses by step, instead of measured ones."""
     chosen, begun = dict(LOSSES), train._log
 
     def log(run: train.TrainingRun, finished: int, *rest: object) -> dict[str, float]:
@@ -102,7 +102,7 @@ def test_at_no_time_is_there_no_checkpoint(
 def test_an_interrupted_run_ends_with_the_same_checkpoints(
     cut_at: int, recipe: Recipe, start: Start, losses: dict[int, float], tmp_path: Path
 ) -> None:
-    """Also where the checkpoint of the interruption is the best so far, which does not stay."""
+    """This holds even if the checkpoint at the interruption is the best so far, and is not kept."""
     losses.update({3: 0.5, 5: 0.4, 7: 0.3})
     kept = of(recipe, 1, validate_every=1)
     start("aegis", tmp_path / "whole", recipe=kept)
@@ -117,7 +117,7 @@ def test_an_interrupted_run_ends_with_the_same_checkpoints(
 def test_a_run_may_go_on_with_another_number(
     recipe: Recipe, start: Start, losses: dict[int, float], tmp_path: Path
 ) -> None:
-    """As where its disk is full: what stays shapes no weight."""
+    """As when its disk is full: the number affects no weight."""
     many, few = of(recipe, None), of(recipe, 1)
     assert training_part(many) == training_part(few)
     with pytest.raises(KeyboardInterrupt):
@@ -127,7 +127,7 @@ def test_a_run_may_go_on_with_another_number(
 
 
 def laid_out(run: Path, steps: Sequence[int], losses: dict[int, float]) -> Path:
-    """The outline of a run: its checkpoints as far as they are looked at here, and its log."""
+    """The outline of a run: its log, and its checkpoints as far as they matter here."""
     for step in steps:
         folder = run / "checkpoints" / f"{step:06d}"
         folder.mkdir(parents=True)
@@ -138,7 +138,7 @@ def laid_out(run: Path, steps: Sequence[int], losses: dict[int, float]) -> Path:
 
 
 def test_later_checkpoints_than_the_new_one_stay(tmp_path: Path) -> None:
-    """They are there where somebody went back to an earlier checkpoint."""
+    """They exist if a user went back to an earlier checkpoint."""
     run = laid_out(tmp_path, (2, 4, 6, 8), {2: 1.0, 4: 2.0})
     retention.prune(run, 6, 1, PLAIN)
     assert steps_in(run) == [2, 6, 8]
@@ -160,9 +160,9 @@ def test_of_equal_losses_the_earliest_stays(tmp_path: Path) -> None:
     ("gate", "drops", "stay"),
     [
         ("mean", {2: 0.5, 4: 4.0, 6: 1.0}, [6, 8]),
-        ("upper", {2: 0.5, 4: 4.0, 6: 1.0}, [2, 8]),  # an interval reaches a point further
-        ("mean", {2: 5.0, 4: 4.0, 6: 6.0}, [4, 8]),  # none keeps to it: the least loss
-        ("mean", {2: 0.5, 6: 1.0}, [6, 8]),  # of the one with the least loss nothing is known
+        ("upper", {2: 0.5, 4: 4.0, 6: 1.0}, [2, 8]),  # the interval reaches one point further
+        ("mean", {2: 5.0, 4: 4.0, 6: 6.0}, [4, 8]),  # none is within it: the smallest loss
+        ("mean", {2: 0.5, 6: 1.0}, [6, 8]),  # nothing is known about the one with the smallest loss
         ("mean", {}, [4, 8]),
     ],
 )

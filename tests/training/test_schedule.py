@@ -1,4 +1,4 @@
-"""Learning rates as functions of the step: their rise, how each schedule falls, and plans."""
+"""Learning rates as functions of the step: warm-up, each schedule's decay, and plans."""
 
 from __future__ import annotations
 
@@ -38,14 +38,14 @@ def test_it_rises_alike_and_then_never_again(
 
 @given(steps=lengths, warmup=rises, share=shares)
 def test_each_schedule_goes_on_as_it_says(steps: int, warmup: int, share: float) -> None:
-    """A line is that of the Trainer of transformers where the share is 0."""
+    """The linear one is that of transformers' Trainer if the share is 0."""
     fall = max(1, steps - warmup)
     for step in range(warmup, steps):
         cosine, linear, constant = (
             warmup_then_decay(step, steps, warmup, share, schedule) for schedule in SCHEDULES
         )
         passed = (step - warmup) / fall
-        # Bit for bit, for runs of earlier versions go on by it.
+        # Bit for bit, since runs of earlier versions continue with it.
         assert cosine == share + (1 - share) * (1 + math.cos(math.pi * passed)) / 2
         assert linear == pytest.approx(share + (1 - share) * (steps - step) / fall)
         assert constant == 1

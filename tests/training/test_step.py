@@ -106,7 +106,7 @@ def test_dual_backward_equals_two_independent_ones(precision: str, weighting: st
         -1,
         0,
         1,
-    }  # conflict, agreement, and the final norm, which neither gradient reaches
+    }  # conflict, agreement, and the final norm, which no gradient reaches
 
 
 def test_w2_in_the_row_is_each_layers_unweighted_cost() -> None:
@@ -143,7 +143,7 @@ def test_no_group_raises_the_cost_and_those_without_conflict_are_naive(
 ) -> None:
     """<g, a> >= 0 up to rounding, with `a` from a graph of its own.
 
-    Where <g, a> was so before, the gradient is naive's bit for bit.
+    If <g, a> was >= 0 before, the gradient is naive's bit for bit.
     """
     anchor = make_moments(seed=seed)
     naive, aegis = adapt(NAIVE, make_policy()), adapt(AEGIS, make_policy(), of_all_tokens(anchor))
@@ -164,7 +164,7 @@ def test_no_group_raises_the_cost_and_those_without_conflict_are_naive(
 def anchor_gradients(policy: Policy, anchor: list[Moments], precision: str) -> Named:
     """Anchor gradients from a graph of their own, through the same operations.
 
-    In bfloat16 any other order rounds differently.
+    In bfloat16 any other order would round differently.
     """
     batch = robot_batch()
     policy.zero_grad()
@@ -210,7 +210,7 @@ def test_an_anchor_that_is_met_exactly_changes_nothing() -> None:
 
 
 def test_a_frozen_part_is_left_alone() -> None:
-    """The projection works over what learns: a frozen layer has no row and no gradient."""
+    """The projection covers trainable parameters: a frozen layer has no row and no gradient."""
 
     def all_but_a_layer(backbone: nn.Module, *_: Any) -> None:
         backbone.requires_grad_(True)
@@ -227,7 +227,7 @@ def test_a_frozen_part_is_left_alone() -> None:
 
 
 def test_any_combination_is_a_line() -> None:
-    """The penalty method: the gradient of loss + 0.1 * penalty, from parts that exist."""
+    """The penalty method: the gradient of loss + 0.1 * penalty, from existing parts."""
     policy, anchor = double_policy(), make_moments()
     task, pull = independent(policy, anchor)
 
@@ -249,7 +249,7 @@ def test_any_combination_is_a_line() -> None:
 def test_auto_is_bf16_where_a_processor_lists_amx(
     listed: dict[str, bool] | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """ARM's list nothing of the kind, and an older torch has no list at all: float32."""
+    """ARM processors list no such feature, and an older torch has no list at all: float32."""
     if listed is None:
         monkeypatch.delattr(torch.cpu, "get_capabilities", raising=False)
     else:

@@ -1,6 +1,6 @@
-"""A step reads no number of its device; what it leaves is read once for many steps.
+"""A step reads no number from its device; its figures are read once for many steps.
 
-There is no GPU here: these tests say that the CPU is a device for which one waits.
+There is no GPU here, so these tests treat the CPU as a device for which one must wait.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def begun(
 
 
 def prepared_batch(run: assemble.TrainingRun) -> step.RobotBatch:
-    """What the thread that fetches ahead hands to a step."""
+    """What the prefetching thread passes to a step."""
     batch = run.demos.batch(run.demos.train[:4], run.recipe.train.chunk)
     size = len(batch), int((~batch.is_pad).sum())
     prepare = run.parts.prepare
@@ -105,7 +105,7 @@ def test_no_frame_is_prepared_within_a_step(
     tmp_path: Path,
     waits: None,
 ) -> None:
-    """Nor the share of them that the anchor gradient is taken on."""
+    """Neither is the share of frames for the anchor gradient."""
     chosen = replace(recipe, aegis=Aegis(fraction=0.5, refresh=refresh))
     run = begun(chosen, "aegis", demos_file, anchor_file, tmp_path)
     run.policy.train()
@@ -151,7 +151,7 @@ def test_the_same_reads_are_seen_where_nobody_waits(
 
 
 def treat_each_map_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Products of stacked maps round in another way, and what ends in the same bytes is asked."""
+    """Products of stacked maps round differently, and this test compares bytes."""
     monkeypatch.setattr(stacking, "groups", lambda sites, *_: [[site] for site in sites])
 
 
@@ -228,7 +228,7 @@ def test_a_step_that_is_not_finite_moves_nothing_however_late_it_is_read(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Neither the weights nor their average, though a constraint may cover that step and others."""
+    """Neither weights nor average move, though a constraint may cover that step and others."""
     real = step.compute_gradients
 
     def broken(*rest: object, index: int, **named: object) -> step.StepGradients:
@@ -250,7 +250,7 @@ def test_a_step_that_is_not_finite_moves_nothing_however_late_it_is_read(
         ends[name] = artifacts.load(last / "training_state/state.safetensors").tensors
     assert ends["at-once"].keys() == ends["late"].keys()
     for name, tensor in ends["at-once"].items():
-        if method == "kfac":  # whose shares of the rates round in another way
+        if method == "kfac":  # its shares of the learning rates round differently
             torch.testing.assert_close(ends["late"][name], tensor, rtol=1e-4, atol=1e-6)
         else:
             assert torch.equal(tensor, ends["late"][name]), name
@@ -306,7 +306,7 @@ def test_moments_of_several_layers_at_once_are_those_of_each(
     layers = [first, (2 * first).detach().requires_grad_(), of_another_width]
     layers += [(i + first).detach().requires_grad_() for i in range(5)]
     expected = graded([padded_moments(h, mask) for h in layers], layers)
-    # As many as two layers have: the last five are three groups.
+    # As many numbers as two layers have: the last five layers form three groups.
     for most in (stacking.MOST, 2 * first.numel(), 1):
         monkeypatch.setattr(stacking, "MOST", most)
         found = graded(joint_moments(layers, mask), layers)
@@ -321,7 +321,7 @@ def test_moments_that_processes_share_are_the_same_without_selecting_rows(
     layers = [(i + first).detach().requires_grad_() for i in range(3)]
 
     def total(here: Tensor) -> Tensor:
-        """The sum over two processes, the other one of which has other tokens."""
+        """The sum over two processes, where the other process has other tokens."""
         return here + torch.ones_like(here)
 
     expected = graded(shared_moments(layers, mask, total), layers)

@@ -1,4 +1,4 @@
-"""Trackers get every line of metrics.jsonl, shape nothing, and are refused where they are not."""
+"""Trackers get every line of metrics.jsonl, change nothing, and are refused if missing."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def tracked(recipe: Recipe, *names: str) -> Recipe:
 
 
 class StandIn:
-    """A tracker's module that writes down what it is told."""
+    """A tracker's module that records its calls."""
 
     def __init__(self) -> None:
         self.begun: dict[str, Any] = {}
@@ -48,7 +48,7 @@ class StandIn:
 
 @pytest.fixture
 def stand_in(monkeypatch: pytest.MonkeyPatch) -> Any:
-    """Put a stand-in in a tracker's place."""
+    """Replace a tracker with the stand-in."""
 
     def put(name: str) -> StandIn:
         found = StandIn()
@@ -123,7 +123,7 @@ def test_a_tracked_run_has_the_same_weights_and_goes_on_untracked(
         start("naive", tmp_path, recipe=watched, on_event=stop_at(3, KeyboardInterrupt()))
     assert tracker.finished
     start("naive", tmp_path, resume=True)
-    # Only the recipe as it was begun tells them apart.
+    # Only the recipe at the start tells them apart.
     (tmp_path / "recipe.yaml").write_bytes((naive_run / "recipe.yaml").read_bytes())
     assert_same_run(tmp_path, naive_run)
 
@@ -163,7 +163,7 @@ def test_another_name_is_no_tracker(aegis: Any, tmp_path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def report() -> dict[str, Any]:
-    """What a probe and a rollout have, as far as trackers take it."""
+    """The parts of a probe and a rollout that trackers receive."""
     families = {"color": {"accuracy": 0.5, "questions": 4, "interval": [0.1, 0.9]}}
     return {"accuracy": 0.5, "passed": True, "drop_interval": [0.0, 1.0], "families": families}
 

@@ -1,4 +1,4 @@
-"""`aegis train` from first step to last: its folder, its figures, and naive against PyTorch."""
+"""`aegis train` from the first step to the last: its folder, its figures, and naive in PyTorch."""
 
 from __future__ import annotations
 
@@ -180,7 +180,7 @@ def test_the_report(start: Start, tmp_path: Path) -> None:
 def test_a_training_says_that_it_loads_before_it_does(
     start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """In a pipe nothing else would: a large model and many frames take minutes."""
+    """In a pipe nothing else would be printed: a large model and many frames take minutes."""
     events: list[Event] = []
 
     def load(name: str) -> NoReturn:
@@ -193,7 +193,7 @@ def test_a_training_says_that_it_loads_before_it_does(
 
 
 def test_learning_rates_warm_up_and_fall(naive_run: Path) -> None:
-    """Two steps of warm-up, then a cosine to a tenth over the remaining four."""
+    """Two steps of warm-up, then a cosine decay to a tenth over the remaining four."""
     factors = [0.5, 1.0] + [0.1 + 0.9 * (1 + math.cos(math.pi * i / 4)) / 2 for i in range(4)]
     for name, peak in (("lr_backbone", SETTINGS.backbone_lr), ("lr_expert", SETTINGS.expert_lr)):
         assert [line[name] for line in metrics(naive_run)] == pytest.approx(
@@ -220,7 +220,7 @@ def test_running_averages_that_move_are_told_once_with_what_keeps_them(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """No known family has any, but a model of the hub may."""
+    """No known family has any, but a model from the hub may."""
     load = loading.backbones.load
 
     def with_averages(name: str) -> Backbone:
@@ -264,18 +264,18 @@ def test_seeds_give_different_runs(
     assert metrics(tmp_path)[-1]["loss"] != metrics(naive_run)[-1]["loss"]
 
 
-# While it traces a graph, torch.compile looks at a field that PyTorch warns of.
+# While tracing a graph, torch.compile accesses a field for which PyTorch warns.
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf")
 def test_a_compiled_policy_trains_alike(
     start: Start, recipe: Recipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Both backward passes go over the compiled graph.
+    """Both backward passes use the compiled graph.
 
-    A backend without code generation keeps this test quick, and so does a validation of one batch:
-    another size would be compiled anew.
+    To keep this test quick, the backend generates no code and the validation has a single batch:
+    another size would be compiled again.
     """
     monkeypatch.setattr(train, "VALIDATION_FRAMES", SETTINGS.batch_size)
-    torch._dynamo.reset()  # beside an earlier test's graphs these would be of any size, and slower
+    torch._dynamo.reset()  # beside an earlier test's graphs these would be dynamic, and slower
     called: list[str] = []
 
     def quickly(real: Callable[..., None], part: Any) -> None:
@@ -319,7 +319,7 @@ def test_training_reads_no_question(
 def test_a_constraint_covers_all_the_steps_since_the_last(
     start: Start, recipe: Recipe, anchor_file: Path, tmp_path: Path
 ) -> None:
-    """At every checkpoint nothing has moved along the protected directions, whatever its turn."""
+    """At every checkpoint nothing has moved along the protected directions, whatever the turn."""
     settings = replace(SETTINGS, weight_decay=0.5)
     start("naive", tmp_path / "lost", recipe=replace(recipe, train=settings))
     assert min(protected_shares(tmp_path / "lost", anchor_file, 0.9)) > 0.01
@@ -355,7 +355,7 @@ def test_a_parameter_takes_the_share_of_each_step_that_the_method_leaves_it(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """All of it: naive, bit for bit. None of it: nothing moves it, weight decay included."""
+    """A share of 1 is naive, bit for bit. At a share of 0 not even weight decay moves it."""
     chosen = "layers.0.up.weight"
     for share in (1.0, 0.0):
 
@@ -418,7 +418,7 @@ def test_naive_equals_a_plain_training_loop(
     of_backbone: Make,
     of_expert: Make,
 ) -> None:
-    """A loop that knows nothing of stages, methods or ledgers reaches the same bits."""
+    """A loop without stages, methods or ledgers reaches the same bits."""
     chosen = replace(SETTINGS, **changes)
     start("naive", tmp_path, recipe=replace(recipe, train=chosen))
     demos = demonstrations.load(demos_file, SETTINGS.validation_share, recipe.seed)
@@ -454,7 +454,7 @@ def test_naive_equals_a_plain_training_loop(
 def batches(
     demos: demonstrations.Demonstrations, seed: int
 ) -> Iterator[tuple[RobotBatch, torch.Generator]]:
-    """What the run's steps saw: one shuffle of the frames per pass, one generator per step."""
+    """The batches of the run's steps: one shuffle of the frames per epoch, one generator a step."""
     frames = np.random.default_rng([seed, 0]).permutation(len(demos.train))
     for i in range(STEPS):
         rows = demos.train[frames[i * SETTINGS.batch_size : (i + 1) * SETTINGS.batch_size]]

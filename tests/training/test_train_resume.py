@@ -1,4 +1,4 @@
-"""Resuming a training, refusing one that must not begin, and what a bad step leaves behind."""
+"""Resuming a training, refusing one that must not start, and what a bad step leaves behind."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ from aegis_cli.training import checkpoint, folder, loading, step, train
 # --- resuming -------------------------------------------------------------------------------------
 
 
-# Every method goes on from its first checkpoint; from a later one goes what keeps or draws more.
+# Every method resumes from its first checkpoint; those with more state or draws from a later one.
 LATER = ("aegis", "cotrain", "ewc", "kfac", "nullspace")
 CUTS = [*((method, 3) for method in sorted(METHODS)), *((method, 5) for method in LATER)]
 
@@ -56,7 +56,7 @@ def test_a_resumed_run_ends_in_the_same_bytes(
     method: str,
     interrupted_at: int,
 ) -> None:
-    """Interrupted between two checkpoints, so that steps are lost and repeated."""
+    """The interruption is between two checkpoints, so steps are lost and repeated."""
     with pytest.raises(KeyboardInterrupt):
         start(method, tmp_path, on_event=stop_at(interrupted_at, KeyboardInterrupt()))
     assert checkpoint.last(tmp_path).resolve().name == f"{interrupted_at - 1:06d}"
@@ -68,7 +68,7 @@ def test_a_resumed_run_ends_in_the_same_bytes(
 def test_running_averages_of_a_resumed_run_go_on_from_where_they_were(
     start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """No known family has any, but a model of the hub may."""
+    """No known family has any, but a model from the hub may."""
     load, save = loading.backbones.load, checkpoint.save
     found: dict[str, torch.Tensor] = {}
 
@@ -80,8 +80,8 @@ def test_running_averages_of_a_resumed_run_go_on_from_where_they_were(
 
     def saved(folder: Path, step: int, policy: Policy, *rest: Any, **more: Any) -> Path:
         norm = policy.backbone.stem.norm
-        assert norm.num_batches_tracked == step  # those of validation do not count
-        found[folder.name] = norm.running_mean.clone()  # in the end the last checkpoint's
+        assert norm.num_batches_tracked == step  # validation passes do not count
+        found[folder.name] = norm.running_mean.clone()  # finally that of the last checkpoint
         return save(folder, step, policy, *rest, **more)
 
     monkeypatch.setattr(loading.backbones, "load", with_averages)
@@ -111,7 +111,7 @@ def test_a_run_that_goes_on_in_another_precision_says_so(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """As on hardware on which `auto` is another; machine.json tells of the beginning alone."""
+    """As on hardware where `auto` differs; machine.json describes only the start."""
     automatic = replace(recipe, train=replace(recipe.train, precision="auto"))
     monkeypatch.setattr(devices, "multiplies_bf16", lambda _: True)
     with pytest.raises(KeyboardInterrupt):
@@ -119,7 +119,7 @@ def test_a_run_that_goes_on_in_another_precision_says_so(
         start("naive", tmp_path, recipe=automatic, anchor=None, on_event=stop)
     monkeypatch.setattr(devices, "multiplies_bf16", lambda _: same)
     told: list[Event] = []
-    for _ in range(2):  # of what has ended there is nothing to say
+    for _ in range(2):  # for a finished run there is nothing to say
         start("naive", tmp_path, recipe=automatic, anchor=None, resume=True, on_event=told.append)
     said = [event.text for event in told if isinstance(event, Warned)]
     assert len(said) == (not same)
@@ -136,7 +136,7 @@ def test_resuming_a_finished_run_changes_nothing(start: Start, tmp_path: Path) -
 def test_a_run_on_demonstrations_that_have_grown_says_so_and_how_another_begins_with_its_policy(
     recipe: Recipe, frame_cache: Path, tmp_path: Path
 ) -> None:
-    """More episodes in the same folder are other demonstrations, though their place is the same."""
+    """More episodes in the same folder are other demonstrations, though the path is the same."""
     made = [replace(e, instruction=lerobot.TEXTS[0]) for e in lerobot.episodes(8)]
     data, run = lerobot.save(tmp_path / "arm", made[:6]), tmp_path / "run"
     train.run(recipe, "naive", data, None, run)
@@ -156,7 +156,7 @@ def test_a_run_on_demonstrations_that_have_grown_says_so_and_how_another_begins_
 
 
 def warned_of_learned_episodes(recipe: Recipe, data: Path, out: Path) -> bool:
-    """Whether a training says that it holds out what it has begun with."""
+    """Whether a training warns that its policy may have learned from held-out episodes."""
     told: list[Event] = []
     train.run(recipe, "naive", data, None, out, on_event=told.append)
     texts = [event.text for event in told if isinstance(event, Warned)]
@@ -180,10 +180,10 @@ def test_resume_without_a_run_begins_one(naive_run: Path, start: Start, tmp_path
 
 
 def test_checkpoints_without_their_link_are_not_begun_anew(start: Start, tmp_path: Path) -> None:
-    """As after a copy by a tool that leaves links out."""
+    """As after a copy with a tool that leaves out links."""
     start("naive", tmp_path)
     link = tmp_path / "checkpoints" / "last"
-    for target in (None, "000005"):  # none, and one that leads nowhere
+    for target in (None, "000005"):  # no link, and one to a missing target
         link.unlink(missing_ok=True)
         if target is not None:
             link.symlink_to(target)
@@ -216,7 +216,7 @@ def test_the_newest_checkpoint_is_that_of_most_steps_however_many_digits_it_has(
 
 
 def refused(found: str, start: Start, method: str, out: Path, **changes: Any) -> AegisError:
-    """The AegisError, with `found` in it, of a training that must not begin and writes nothing."""
+    """The AegisError, containing `found`, of a training that must not start and writes nothing."""
     before = contents(out) if out.exists() else None
     with pytest.raises(AegisError) as caught:
         start(method, out, **changes)
@@ -250,7 +250,7 @@ def test_an_overwriting_that_was_cut_short_can_be_repeated(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Also where a killed process was about to write a file."""
+    """This includes a killed process that was about to write a file."""
     start("naive", tmp_path)
     if left is not None:
         (tmp_path / left).write_bytes(b"half")
@@ -259,7 +259,7 @@ def test_an_overwriting_that_was_cut_short_can_be_repeated(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patched:
-        # An order in which the recipe comes before what takes long to remove.
+        # An order in which the recipe comes before the files that take long to remove.
         listed = sorted(tmp_path.iterdir(), reverse=True)
         patched.setattr(Path, "iterdir", lambda _: iter(listed))
         patched.setattr(folder.shutil, "rmtree", cut)
@@ -347,7 +347,7 @@ def test_a_run_goes_on_with_its_own_settings_only(
         naive_run,
         resume=True,
     )
-    assert method.found.endswith("lora here")  # and of lora's options, which naive has not, nothing
+    assert method.found.endswith("lora here")  # and nothing about lora's options, which naive lacks
 
 
 def test_what_does_not_shape_training_may_change_and_the_run_says_so(
@@ -535,7 +535,7 @@ def finite(folder: Path) -> bool:
 def test_an_enormous_learning_rate(
     start: Start, recipe: Recipe, tmp_path: Path, method: str, rates: dict[str, float]
 ) -> None:
-    """Whatever diverges first, the run ends in one clear error or not at all.
+    """Whatever diverges first, the run ends with one clear error or completes.
 
     That may be the loss, a gradient, W2 or an inner product.
     """
@@ -545,7 +545,7 @@ def test_an_enormous_learning_rate(
     except AegisError as error:
         assert "step" in error.found and "lr" in error.fix
     else:
-        assert len(rates) == 1  # a layer's norm takes its input at any scale
+        assert len(rates) == 1  # a layer's norm accepts inputs of any scale
     assert finite(checkpoint.last(tmp_path))
 
 
@@ -559,7 +559,7 @@ def test_a_step_that_is_not_finite_is_not_taken(
     where: str,
     bad: float,
 ) -> None:
-    """Step 4 goes wrong: the checkpoint is of step 3, and from it the run can go on."""
+    """Step 4 goes wrong: the checkpoint is that of step 3, and the run can resume from it."""
     reference = tmp_path_factory.mktemp("reference")
     start("aegis", reference)
     with monkeypatch.context() as patch:
@@ -581,7 +581,7 @@ def test_a_divergence_right_after_a_checkpoint_leaves_it_alone(
 ) -> None:
     """Step 3 goes wrong, and the checkpoint of step 2 is not written again.
 
-    So there is one at every moment.
+    So a checkpoint exists at every moment.
     """
     seen = []
 
@@ -601,10 +601,10 @@ def test_a_divergence_right_after_a_checkpoint_leaves_it_alone(
 def test_a_validation_loss_that_is_not_finite_ends_the_run(
     start: Start, naive_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bad: float
 ) -> None:
-    """Finite steps may lead to no model: nothing of step 3 is kept, nor told."""
+    """Finite steps may give a broken model: nothing of step 3 is kept or reported."""
     with monkeypatch.context() as patch:
         patch.setattr(train, "validation_loss", lambda *_: bad)
-        for _ in range(2):  # a run that goes on ends alike
+        for _ in range(2):  # a resumed run ends the same way
             with pytest.raises(Diverged, match=f"validation loss {bad:g} after step 3") as caught:
                 start("naive", tmp_path, resume=True)
             assert caught.value.good_steps == 3 and "lower train.backbone_lr" in caught.value.fix
@@ -615,7 +615,7 @@ def test_a_validation_loss_that_is_not_finite_ends_the_run(
 
 
 def spoiled(where: str, bad: float, at: int) -> Callable[..., step.StepGradients]:
-    """`compute_gradients` with one figure of the call number `at` replaced."""
+    """`compute_gradients` with one value replaced in call number `at`."""
     compute, calls = step.compute_gradients, []
 
     def spoil(policy: Policy, *args: Any, **options: Any) -> step.StepGradients:
@@ -641,7 +641,7 @@ STATE_FILE = f"checkpoints/000002/{checkpoint.STATE}"
 def test_a_full_disk_leaves_what_was_complete(
     start: Start, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory, file: str
 ) -> None:
-    """The disk is full from step 3 on, so that `file` does not fit any more."""
+    """The disk is full from step 3 on, so `file` no longer fits."""
     reference = tmp_path_factory.mktemp("reference")
     start("aegis", reference)
     limit = (reference / file).stat().st_size - 1
@@ -667,7 +667,7 @@ def test_a_full_disk_leaves_what_was_complete(
 def largest_file_from(size: int, after: int) -> Iterator[OnEvent]:
     """A listener that fills the disk once step `after` is done.
 
-    No file may grow beyond `size` bytes.
+    No file can grow beyond `size` bytes.
     """
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
 

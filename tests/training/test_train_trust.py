@@ -1,4 +1,4 @@
-"""Trainings beside others, ended by signals, and continued from files that are not their own."""
+"""Trainings beside others, ended by signals, and resumed with files that do not belong to them."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from aegis_cli.training.assemble import TrainingRun
 
 
 def refused(found: str, start: Start, method: str, out: Path, **changes: Any) -> AegisError:
-    """The error of a training that does not go on, and leaves every file as it was."""
+    """The error of a training that cannot continue and leaves every file as it was."""
     before = contents(out)
     with pytest.raises(AegisError) as caught:
         start(method, out, **changes)
@@ -70,7 +70,7 @@ def test_a_refused_training_waits_for_nothing(start: Start, tmp_path: Path) -> N
 
 
 def signal_at(done: int, *numbers: int, stage: str = "train") -> OnEvent:
-    """A process gets these signals after that step, or that part of another stage."""
+    """Send this process these signals after that step, or that part of another stage."""
 
     def on_event(event: Event) -> None:
         if isinstance(event, Progress) and (event.stage, event.done) == (stage, done):
@@ -82,20 +82,20 @@ def signal_at(done: int, *numbers: int, stage: str = "train") -> OnEvent:
 
 @pytest.fixture
 def ctrl_c() -> Any:
-    """Ctrl-C as a fresh process has it."""
+    """Ctrl-C as in a fresh process."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
 
 
-# That every method goes on from a checkpoint is tested in `test_train_resume`. These differ in
-# where a signal lets them save: two constrain updates of several steps, and three do not.
+# Resuming every method from a checkpoint is tested in `test_train_resume`. These differ in
+# where they can save after a signal: two constrain updates of several steps, and three do not.
 @pytest.mark.usefixtures("ctrl_c")
 @pytest.mark.parametrize("method", ["naive", "aegis", "lora", "kfac", "nullspace"])
 def test_ctrl_c_saves_the_steps_and_the_resumed_run_ends_in_the_same_bytes(
     method: str, whole_run: Callable[[str], Path], start: Start, tmp_path: Path
 ) -> None:
-    """After step 3, between two checkpoints; a method that constrains goes on to the next one."""
+    """After step 3, between two checkpoints; a method that constrains continues to the next one."""
     with pytest.raises(KeyboardInterrupt):
         start(method, tmp_path, on_event=signal_at(3, signal.SIGINT))
     assert checkpoint.last(tmp_path).resolve().name in ("000003", "000004")
@@ -131,7 +131,7 @@ def test_a_validation_is_left_at_a_signal_and_made_again_by_the_resumed_run(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """After step 3, of which no checkpoint stays, and after the last one; also left twice."""
+    """After step 3, whose checkpoint is not kept, and after the last; also interrupted twice."""
     settings = replace(SETTINGS, validate_every=at, log_every=4, ema_decay=0.5, keep_checkpoints=1)
     one = replace(recipe, train=settings)
     start("aegis", tmp_path / "whole", recipe=one)
@@ -157,7 +157,7 @@ def test_a_validation_is_left_at_a_signal_and_made_again_by_the_resumed_run(
 def test_a_validation_that_fails_leaves_a_checkpoint_of_its_step(
     at: int, start: Start, recipe: Recipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Also where the run that goes on is killed once it has written the step's line."""
+    """This holds even if the resumed run is killed after it has written the step's line."""
     one = replace(recipe, train=replace(SETTINGS, validate_every=at, validate_actions=4))
     start("naive", tmp_path / "whole", recipe=one)
 
@@ -203,7 +203,7 @@ def test_ctrl_c_after_the_last_step_finishes_the_run(
 def test_a_file_that_is_written_to_while_it_is_trained_on(
     changed: str, start: Start, demos_file: Path, anchor_file: Path, tmp_path: Path
 ) -> None:
-    """Its tensors are mapped: training would go on with others under the old file's digest."""
+    """Its tensors are memory-mapped: training would use other data under the old file's digest."""
     files = {"demos": demos_file, "anchor": anchor_file}
     copied = shutil.copy(files[changed], tmp_path / "copy.safetensors")
 
@@ -239,12 +239,12 @@ def test_a_file_that_is_only_touched_ends_no_training(
 # --- weights --------------------------------------------------------------------------------------
 
 
-# Found at a checkpoint, or by the next step's loss.
+# Found at a checkpoint, or from the next step's loss.
 @pytest.mark.parametrize(("wrong", "good"), [(4, 2), (5, 4)])
 def test_weights_that_are_not_finite_reach_no_checkpoint(
     wrong: int, good: int, start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A knob of 1e300 can do that after a step whose loss and gradient are finite."""
+    """A setting of 1e300 can cause this after a step whose loss and gradient are finite."""
     update = train.update
 
     def spoiled(run: TrainingRun, index: int, *args: Any, **options: Any) -> None:
@@ -263,7 +263,7 @@ def test_weights_that_are_not_finite_reach_no_checkpoint(
 
 
 def interrupted(start: Start, method: str, out: Path, **changes: Any) -> Path:
-    """A run after four of its steps."""
+    """A run after four steps."""
     with pytest.raises(KeyboardInterrupt):
         start(method, out, on_event=stop_at(5, KeyboardInterrupt()), **changes)
     return out
@@ -271,7 +271,7 @@ def interrupted(start: Start, method: str, out: Path, **changes: Any) -> Path:
 
 @pytest.fixture(scope="module")
 def half(start: Start, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run of aegis after four of its steps."""
+    """A run of aegis after four steps."""
     return interrupted(start, "aegis", tmp_path_factory.mktemp("half") / "run")
 
 
@@ -288,12 +288,12 @@ def test_a_copy_that_followed_links_goes_on(half: Path, start: Start, tmp_path: 
 
 
 def resaved(path: Path, change: Callable[[dict[str, Tensor], dict[str, Any]], object]) -> None:
-    """The same artifact with other tensors or meta, and a header that lists them."""
+    """Write the same artifact with other tensors or meta, and a header that lists them."""
     kept = artifacts.load(path)
     tensors = {name: tensor.clone() for name, tensor in kept.tensors.items()}
     meta, header = dict(kept.header.meta), kept.header
     change(tensors, meta)
-    path.unlink()  # what is mapped stays
+    path.unlink()  # mapped data stays
     artifacts.save(
         path,
         header.kind,
@@ -343,7 +343,7 @@ def test_a_training_state_that_does_not_fit_is_refused(
 def test_a_run_with_a_damaged_state_goes_on_from_an_earlier_checkpoint_or_anew(
     keep: float, run: Path, start: Start, tmp_path: Path
 ) -> None:
-    """As the error says: both end in the bytes of a run that was never interrupted."""
+    """As the error says: both end with the bytes of a run that was never interrupted."""
     state = checkpoint.last(run) / checkpoint.STATE
     data = state.read_bytes()
     state.write_bytes(data[: int(keep * len(data))])

@@ -92,7 +92,7 @@ def test_chunks_end_with_their_episode() -> None:
 def test_the_episode_that_follows_in_the_file_never_reaches_the_loss(
     demos_file: Path, tiny_folder: Path
 ) -> None:
-    """Chunks at an episode's last frame are the same, whatever the next episode's actions are."""
+    """Chunks at an episode's last frame are the same, whatever the next episode's actions."""
     demos, losses = load(demos_file), []
     last = int(demos.tensors["episode_starts"][1]) - 1
     backbone = backbones.load(str(tiny_folder))

@@ -1,4 +1,4 @@
-"""Training refuses, before a step moves anything, what its method does not see."""
+"""Training refuses, before a step moves anything, parts that its method cannot see."""
 
 from __future__ import annotations
 

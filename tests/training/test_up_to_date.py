@@ -1,4 +1,4 @@
-"""Records of stages that are damaged: one error that says what to remove."""
+"""Damaged records of stages: one error that says what to remove."""
 
 from __future__ import annotations
 

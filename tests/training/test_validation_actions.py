@@ -1,4 +1,4 @@
-"""Held-out actions predicted while a run trains: their error shows, and training is not changed."""
+"""Held-out actions predicted during training: their error is shown, and training is unchanged."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ PREDICTING = replace(SETTINGS, validate_actions=COUNT, validation_share=0.4)
 
 @pytest.fixture
 def predicting(recipe: Recipe) -> Recipe:
-    """A proximal step of `kfac` covers four steps, and a validation comes within."""
+    """A proximal step of `kfac` covers four steps, and a validation falls within them."""
     return replace(recipe, train=PREDICTING, kfac=Kfac(every=4))
 
 
@@ -50,7 +50,7 @@ def without(recipe: Recipe) -> Recipe:
 
 
 def of_report(report: OpenLoopReport) -> dict[str, float]:
-    """The figures that a line of metrics has of what `aegis evaluate` found."""
+    """The figures from `aegis evaluate`'s report that are in a line of metrics."""
     assert report.relative_error is not None and report.relative_interval is not None
     low, high = report.relative_interval
     found = {
@@ -83,7 +83,7 @@ def test_training_does_not_notice_them(
         {},
         {"ema_decay": 0.6},
         {"normalization": "quantiles"},
-        {"validate_actions": 10_000},  # more than there are: `aegis evaluate` takes all of them too
+        {"validate_actions": 10_000},  # more than exist: `aegis evaluate` takes all of them too
     ],
     ids=str,
 )
@@ -112,7 +112,7 @@ def test_the_figures_are_those_of_evaluate_on_the_checkpoint(
 def test_a_real_robot_has_its_position_beside_them(
     relative: bool, predicting: Recipe, start: Start, tmp_path: Path
 ) -> None:
-    """Its actions are positions; a policy of actions relative to them is compared alike."""
+    """Its actions are positions; a policy of actions relative to them is compared the same way."""
     demos = tmp_path / "arm"
     lerobot.save(demos, lerobot.episodes(6, texts=lerobot.READABLE), action_names=("x", "z"))
     own = replace(predicting, train=replace(PREDICTING, relative_actions=relative))
@@ -152,7 +152,7 @@ def test_models_of_the_hub_predict_too(
     assert of_metrics(metrics(tmp_path / "run")[-1]) == pytest.approx(of_report(found), rel=1e-3)
 
 
-# While it traces a graph, torch.compile looks at a field that PyTorch warns of.
+# While tracing a graph, torch.compile accesses a field for which PyTorch warns.
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf")
 def test_nothing_is_compiled_for_predictions(
     predicting: Recipe,
@@ -161,7 +161,7 @@ def test_nothing_is_compiled_for_predictions(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Nor for a step or a validation after them: all that is compiled is there before the first."""
+    """Nor for later steps or validations: everything is compiled before the first of these."""
     graphs, before = compiled_graphs(monkeypatch), []
     figures = validation_actions.ValidationActions.figures
 
@@ -172,7 +172,7 @@ def test_nothing_is_compiled_for_predictions(
     monkeypatch.setattr(validation_actions.ValidationActions, "figures", noted)
     settings = replace(PREDICTING, steps=2, validate_every=1, compile=True)
     compiling = replace(predicting, train=settings)
-    torch._dynamo.reset()  # an earlier test's graphs would serve as well
+    torch._dynamo.reset()  # an earlier test's graphs would also be used
     start("naive", tmp_path / "run", recipe=compiling)
     assert before == [len(graphs)] * 2 and graphs
     found = open_loop.run(tmp_path / "run", demos_file, frames=COUNT)
@@ -188,7 +188,7 @@ def test_they_are_predicted_with_every_validation_loss_and_no_other_time(
     for line in lines:
         assert ("validation_loss" in line) == FIGURES.issubset(line)
     shown = [e for e in events if isinstance(e, Progress) and e.stage == "actions"]
-    # Those of the first time; they were short, so that others would be two lines of a log each.
+    # Those of the first time; it was short, so later ones would only add two lines each to a log.
     assert [e.done for e in shown] == sorted(e.done for e in shown) and shown[-1].done == COUNT
     told = [e.metrics for e in events if isinstance(e, Progress) and e.stage == "train"][-1]
     assert told["action error"] == lines[-1]["action_error"]
@@ -211,7 +211,7 @@ def test_a_run_goes_on_with_the_same_frames(
     events: list[Event] = []
     whole = tmp_path / "whole"
     report = start("naive", whole, recipe=predicting, resume=True, on_event=events.append)
-    # A run that has ended tells its figures and predicts nothing.
+    # A finished run reports its figures and predicts nothing.
     assert not [e for e in events if getattr(e, "stage", "") == "actions"]
     assert report.validation_actions["relative_error"] == metrics(whole)[-1]["action_error"]
 
@@ -237,7 +237,7 @@ def test_inspect_and_the_page_tell_them(predicting: Recipe, start: Start, tmp_pa
     early = folders.inspect(tmp_path / "run" / "checkpoints" / "000004")
     line = metrics(tmp_path / "run")[SETTINGS.validate_every - 1]
     assert early.facts["validation_actions"]["relative_error"] == line["action_error"]
-    # `aegis run` keeps the report, and reads it again for its page.
+    # `aegis run` keeps the report, and reads it later for its page.
     files.save_json(tmp_path / "train.json", report.to_json())
     kept = kept_figures.read(tmp_path / "train.json", kept_figures.TrainFigures)
     assert kept["validation_actions"] == report.validation_actions

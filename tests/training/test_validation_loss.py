@@ -1,4 +1,4 @@
-"""The validation loss: a figure of the weights and the held-out frames, and of nothing else."""
+"""The validation loss: it depends on the weights and the held-out frames, and nothing else."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def test_it_writes_nothing_to_the_policy(demos: Demonstrations, policy: Policy) 
 def test_a_long_validation_has_progress_of_its_own(
     long_s: float, start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """On a large model it takes minutes; of a short one each would be two lines of a log."""
+    """On a large model it takes minutes; a short one would only add two lines each to a log."""
     monkeypatch.setattr(train, "_LONG_S", long_s)
     events: list[Event] = []
     start("naive", tmp_path / "run", anchor=None, on_event=events.append)

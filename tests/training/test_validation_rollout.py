@@ -1,4 +1,4 @@
-"""Episodes played while a run trains: they show success, and training does not notice them."""
+"""Episodes played during training: they show success, and training is unchanged."""
 
 from __future__ import annotations
 
@@ -43,9 +43,9 @@ Reports = list[RolloutReport]
 
 @pytest.fixture
 def playing(recipe: Recipe) -> Recipe:
-    """Constraints of `nullspace` and `kfac` cover four steps, and a validation comes within.
+    """Constraints of `nullspace` and `kfac` cover four steps, and a validation falls within them.
 
-    Whole chunks are executed, so that an episode takes few predictions.
+    Whole chunks are executed, so an episode takes few predictions.
     """
     return replace(
         recipe,
@@ -61,7 +61,7 @@ def without(recipe: Recipe) -> Recipe:
 
 @pytest.fixture
 def played(monkeypatch: pytest.MonkeyPatch) -> Reports:
-    """The whole report of what is played while a run trains, validation by validation."""
+    """The whole report of each rollout during training, validation by validation."""
     found: Reports = []
     play = validation_rollout.play
 
@@ -74,12 +74,12 @@ def played(monkeypatch: pytest.MonkeyPatch) -> Reports:
 
 
 def again(run: Path, stream: int = VALIDATION) -> RolloutReport:
-    """What the same episodes show of a run's last checkpoint, or of a checkpoint."""
+    """The same episodes played with a run's last checkpoint, or with a checkpoint."""
     return rollout.run(run, None, COUNT, "seen", stream=stream, seed=SEED)
 
 
 def assert_same_episodes(one: RolloutReport, other: RolloutReport, rel: float = 1e-4) -> None:
-    """How far from its target each ended, and how it moved, tell two policies apart."""
+    """Each episode's final distance to its target and its motion tell two policies apart."""
     assert one.outcomes == other.outcomes and one.interval == other.interval
     assert one.final_distance_m == pytest.approx(other.final_distance_m, rel=rel)
     assert one.action_change == pytest.approx(other.action_change, rel=rel)
@@ -139,7 +139,7 @@ def test_no_evaluation_plays_these_episodes_and_tuning_does(
     assert mine == {(SEED, VALIDATION, number) for number in range(COUNT)}
     drawn.clear()
     again(tmp_path / "run", EVALUATION)
-    # A seed's streams share no episode, whatever the seed of demonstrations and evaluations is.
+    # A seed's streams share no episode, whatever the seed of demonstrations and evaluations.
     assert len(drawn) == COUNT and not mine & set(drawn)
     assert {stream for _, stream, _ in mine} & {DEMOS, EVALUATION} == set()
     first = {stream: draw(SEED, stream, 0).random() for stream in (DEMOS, EVALUATION, VALIDATION)}
@@ -156,7 +156,7 @@ def test_they_are_played_with_every_validation_loss_and_no_other_time(
         assert ("validation_loss" in line) == FIGURES.issubset(line)
     assert len(played) == STEPS // SETTINGS.validate_every
     shown = [e for e in events if isinstance(e, Progress) and e.stage == "rollout"]
-    # Those of the first time; they were short, so that others would be two lines of a log each.
+    # Those of the first time; it was short, so later ones would only add two lines each to a log.
     assert [e.done for e in shown] == sorted(e.done for e in shown) and shown[-1].done > 0
     assert shown[-1].done == shown[-1].total
     told = [e.metrics for e in events if isinstance(e, Progress) and e.stage == "train"][-1]
@@ -181,7 +181,7 @@ def test_a_run_goes_on_with_the_same_episodes(
     assert_resumes(start, "naive", playing, tmp_path)
     events: list[Event] = []
     report = start("naive", tmp_path / "whole", recipe=playing, resume=True, on_event=events.append)
-    # A run that has ended tells its figures and plays nothing.
+    # A finished run reports its figures and plays nothing.
     assert not [e for e in events if "rollout" in getattr(e, "stage", "")]
     last = metrics(tmp_path / "whole")[-1]
     assert report.validation_rollout["success"] == last["rollout_success"]
@@ -211,7 +211,7 @@ def test_inspect_and_the_page_tell_them(playing: Recipe, start: Start, tmp_path:
         "success": line["rollout_success"],
         "interval": [line["rollout_low"], line["rollout_high"]],
     }
-    # `aegis run` keeps the report, and reads it again for its page.
+    # `aegis run` keeps the report, and reads it later for its page.
     files.save_json(tmp_path / "train.json", report.to_json())
     kept = kept_figures.read(tmp_path / "train.json", kept_figures.TrainFigures)
     assert kept["validation_rollout"] == report.validation_rollout
@@ -262,12 +262,12 @@ def test_models_of_the_hub_act_too(
     for name in ("backbone/model.safetensors", "expert.safetensors"):
         one, other = (checkpoint.last(tmp_path / run) / name for run in ("run", "plain"))
         assert one.read_bytes() == other.read_bytes()
-    # A checkpoint is read in float32, whatever it is stored in.
+    # A checkpoint is read in float32, whatever dtype it is stored in.
     rel = 1e-2 if changes.get("weights") == "bf16" else 1e-4
     assert_same_episodes(played[0], again(tmp_path / "run"), rel)
 
 
-# While it traces a graph, torch.compile looks at a field that PyTorch warns of.
+# While tracing a graph, torch.compile accesses a field for which PyTorch warns.
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf")
 def test_nothing_is_compiled_for_episodes(
     playing: Recipe,
@@ -276,7 +276,7 @@ def test_nothing_is_compiled_for_episodes(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Nor for a step or a validation after them: all that is compiled is there before the first."""
+    """Nor for later steps or validations: everything is compiled before the first of these."""
     graphs, before = compiled_graphs(monkeypatch), []
     figures = validation_rollout.ValidationEpisodes.figures
 
@@ -286,7 +286,7 @@ def test_nothing_is_compiled_for_episodes(
 
     monkeypatch.setattr(validation_rollout.ValidationEpisodes, "figures", noted)
     compiling = replace(playing, train=replace(SETTINGS, steps=2, validate_every=1, compile=True))
-    torch._dynamo.reset()  # an earlier test's graphs would serve as well
+    torch._dynamo.reset()  # an earlier test's graphs would also be used
     start("naive", tmp_path / "run", recipe=compiling)
     assert before == [len(graphs)] * 2 and graphs
     assert_same_episodes(played[-1], again(tmp_path / "run"))
@@ -331,7 +331,7 @@ def test_memory_that_does_not_suffice_to_act_is_told(
     monkeypatch.setattr(validation_rollout, "longest_s", full)
     plan = dry_run.run(playing, "naive", demos_file, None, tmp_path / "run")
     assert plan.memory_fits is False and plan.memory_measured_mb is None
-    assert plan.step_s is not None and plan.step_s > 0  # the steps before it fitted
+    assert plan.step_s is not None and plan.step_s > 0  # the steps before it fit
     assert (plan.validation_s, plan.hours) == (None, None)
 
 

@@ -1,4 +1,4 @@
-"""How long a validation takes, as a dry run tells it: by the second pass of each of its parts."""
+"""How long a validation takes in a dry run: estimated from the second pass of each part."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from aegis_cli.training.validation_time import expected_s
 
 
 class Clock:
-    """A clock that goes on only when it is told to."""
+    """A clock that advances only when told to."""
 
     def __init__(self) -> None:
         self.now = 0.0
@@ -33,7 +33,7 @@ SIZES = st.lists(st.integers(1, 9), min_size=1, max_size=6)
 def test_what_is_done_once_does_not_count_where_there_is_a_second_part(
     sizes: list[int], first: int, each: int
 ) -> None:
-    """Each part takes as long as it is large, and the first one something more."""
+    """Each part takes time in proportion to its size, and the first one takes extra time."""
     clock, done = Clock(), 0
     taken: list[int] = []
 
@@ -67,7 +67,7 @@ def test_an_error_of_the_work_is_its_own() -> None:
 
 @pytest.fixture
 def watching(recipe: Recipe) -> Recipe:
-    """All that a validation can do, with several passes for each part of it."""
+    """Everything that a validation can do, with several passes for each part."""
     return replace(
         recipe,
         train=replace(SETTINGS, validate_actions=12, validation_share=0.4),
@@ -82,10 +82,10 @@ def watching(recipe: Recipe) -> Recipe:
 def test_a_dry_run_tells_the_parts_that_there_are(
     method: str, without: set[str], watching: Recipe, demos_file: Path, tmp_path: Path
 ) -> None:
-    """A backbone that stands still is not asked again."""
+    """A frozen backbone is not asked again."""
     events: list[Event] = []
     plan = dry_run.run(watching, method, demos_file, None, tmp_path / "run", False, events.append)
-    # After the steps, whose gradients and moments a validation has beside it in a training.
+    # After the steps, whose gradients and moments are in memory during a training's validation.
     stages = [e.stage for e in events if isinstance(e, Progress) and e.stage.startswith("dry run")]
     assert stages.index("dry run (validation)") > max(
         place for place, stage in enumerate(stages) if stage == "dry run"

@@ -1,4 +1,4 @@
-"""Questions asked while a run trains: they show what is lost, and training does not notice them."""
+"""Questions asked during training: they show what is lost, and training is unchanged."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ FIGURES = {f"vqa_{name}" for name in validation_vqa._FIGURES}
 
 @pytest.fixture
 def asking(recipe: Recipe) -> Recipe:
-    """Constraints of `nullspace` and `kfac` cover four steps, and a validation comes within."""
+    """Constraints of `nullspace` and `kfac` cover four steps, and a validation falls within."""
     return replace(
         recipe,
         probe=Probe(while_training=COUNT, seed=3, batch_size=8),
@@ -74,7 +74,7 @@ def asked_of(model: str, recipe: Recipe, name: str = "scenes") -> list[Any]:
 
 @pytest.mark.parametrize(
     ("method", "changes"),
-    [  # what `lora` adds is merged, and averaged; it has no part in how a batch passes
+    [  # `lora`'s terms are merged, and averaged; it does not affect how batches are processed
         *(("naive", each) for each in ({}, {"ema_decay": 0.6}, {"accumulate": 2})),
         *(("lora", each) for each in ({}, {"ema_decay": 0.6})),
     ],
@@ -161,7 +161,7 @@ def test_a_run_goes_on_with_the_same_answers_before(
     assert_resumes(start, "naive", asking, tmp_path)
     events: list[Event] = []
     report = start("naive", tmp_path / "whole", recipe=asking, resume=True, on_event=events.append)
-    # A run that has ended tells its figures and asks nothing.
+    # A finished run reports its figures and asks nothing.
     assert not [e for e in events if "VQA" in getattr(e, "stage", "")]
     assert (
         report.validation_vqa["scenes"]["accuracy"]
@@ -201,7 +201,7 @@ def test_inspect_and_the_page_tell_them(asking: Recipe, start: Start, tmp_path: 
     line = metrics(tmp_path / "run")[SETTINGS.validate_every - 1]
     told = early.facts["validation_vqa"]["scenes"]
     assert told["cross_entropy"] == line["vqa_cross_entropy"]
-    # `aegis run` keeps the report, and reads it again for its page.
+    # `aegis run` keeps the report, and reads it later for its page.
     files.save_json(tmp_path / "train.json", report.to_json())
     kept = kept_figures.read(tmp_path / "train.json", kept_figures.TrainFigures)
     assert kept["validation_vqa"] == report.validation_vqa
@@ -211,7 +211,7 @@ def test_inspect_and_the_page_tell_them(asking: Recipe, start: Start, tmp_path: 
 
 @pytest.mark.parametrize(
     ("family", "changes"),
-    [  # masters are of weights, whosever they are; modules are checkpointed, and compute in bf16
+    [  # weights in any module can have masters; checkpointing, and computing in bf16
         ("smolvlm", {"weights": "bf16-master"}),
         ("smolvlm", {"weights": "bf16-master", "freeze": "vision"}),
         ("smolvlm", {"gradient_checkpointing": True}),

@@ -120,7 +120,7 @@ def test_a_missing_meta_file(
 
 @pytest.mark.parametrize("command", [FROM_FOLDER, ("inspect", "d")])
 def test_a_recording_that_was_broken_off(command: tuple[str, ...], bad: Bad, folder: Path) -> None:
-    """LeRobot writes the rows of episodes last: a recording that is killed has none."""
+    """LeRobot writes the rows of episodes last: a recording that was killed has none."""
     (folder / EPISODES).unlink()
     bad(*command, says=("which LeRobot writes when a recording ends", "record it again"))
     (folder / "meta/tasks.parquet").unlink()
@@ -129,7 +129,7 @@ def test_a_recording_that_was_broken_off(command: tuple[str, ...], bad: Bad, fol
 
 
 def rename_camera(name: str) -> Callable[[dict[str, Any]], None]:
-    """The camera is a video of that name, whose file's path holds the name."""
+    """Rename the camera to a video of that name, whose file's path contains the name."""
 
     def change(info: dict[str, Any]) -> None:
         features = info["features"]
@@ -449,7 +449,7 @@ def test_a_corrupt_video(damage: str, bad: Bad, filmed: Path) -> None:
 
 
 def test_a_video_that_was_not_downloaded(bad: Bad, filmed: Path) -> None:
-    """It is the same whether frames are decoded before the training or on demand."""
+    """The error is the same whether frames are decoded before the training or on demand."""
     (filmed / VIDEO).unlink()
     for cache in ("true", "false"):
         bad(*FROM_FOLDER, "--set", f"demos.cache={cache}", says=(VIDEO, "get the dataset again"))
@@ -463,7 +463,7 @@ def test_a_video_that_ends_too_early(bad: Bad, filmed: Path, place: Path) -> Non
 
 @pytest.mark.parametrize("name", [IMAGE, EPISODES, "meta/tasks.parquet"])
 def test_a_pipe_in_place_of_a_parquet_file(name: str, bad: Bad, folder: Path) -> None:
-    """Whoever opened it would wait for ever."""
+    """Opening it would wait forever."""
     (folder / name).unlink()
     os.mkfifo(folder / name)
     bad(*FROM_FOLDER, says=(name, "is a pipe"))

@@ -1,4 +1,4 @@
-"""Frames out of videos by their time, and in the size that a backbone reads."""
+"""Frames of videos found by their time, and resized to the backbone's input."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ DATA = "data/chunk-000/file-000.parquet"
 
 
 def test_frames_are_found_by_their_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Frames are found also where episodes are longer than parts, and key frames are far apart."""
+    """This includes episodes longer than a part of the decoding, with key frames far apart."""
     made = episodes(40, size=(16, 16), smooth=True, seed=3)
     folder = save(tmp_path / "d", made, as_video=True)
     path = folder / "videos/observation.images.top/chunk-000/file-000.mp4"
@@ -75,7 +75,7 @@ def test_frames_of_open_groups_are_found_wherever_reading_begins(tmp_path: Path)
 
 
 def test_what_a_killed_decoding_left_is_removed_by_the_next(tmp_path: Path) -> None:
-    """Of another dataset too: it might never be decoded again, and is as large as its frames."""
+    """It may be of another dataset, which might never be decoded again, and takes as much space."""
     folder = cache.folder("frames")
     folder.mkdir(parents=True)
     left, own = folder / ".0123456789abcdef.npy.12345.tmp", folder / "mine.tmp"
@@ -104,7 +104,7 @@ def encode(path: Path, pictures: list[np.ndarray], gop: int, codec: str) -> None
 
 @pytest.mark.parametrize(("shift", "fine"), [(0.4, True), (-0.4, True), (0.6, False)])
 def test_the_tolerance_is_half_a_frame(shift: float, fine: bool, tmp_path: Path) -> None:
-    """A clock that is off by less still finds every frame; by more, the last time has none."""
+    """A clock that is off by less still finds every frame; by more, the last frame is missing."""
     made = episodes(1, size=(16, 16), smooth=True)
     folder = save(tmp_path / "d", made, as_video=True)
     path = folder / "meta/episodes/chunk-000/file-000.parquet"
@@ -120,7 +120,7 @@ def test_the_tolerance_is_half_a_frame(shift: float, fine: bool, tmp_path: Path)
         read(folder)
     table = parquet.read_table(path)
     end = "videos/observation.images.top/to_timestamp"
-    parquet.write_table(table.drop_columns([end]), path)  # as where nobody tells the end
+    parquet.write_table(table.drop_columns([end]), path)  # as if no end were stated
     with pytest.raises(AegisError, match=r"no frame at 0\.460 s"):
         read(folder)
 
@@ -132,7 +132,7 @@ def test_the_tolerance_is_half_a_frame(shift: float, fine: bool, tmp_path: Path)
 def test_no_episode_has_pictures_of_another_one(
     what: str | None, past: int, tmp_path: Path
 ) -> None:
-    """The episodes' videos lie in one file, one after the other."""
+    """The episodes' videos are in one file, one after the other."""
     made = [whole(number) for number in range(3)]
     folder = save(tmp_path / "d", made, as_video=True)
     times = np.arange(20) / 10
@@ -161,7 +161,7 @@ def test_no_episode_has_pictures_of_another_one(
 
 
 def whole(number: int) -> NewEpisode:
-    """An episode of 20 frames, all of a colour that says which it is."""
+    """An episode of 20 frames, all of one colour that identifies it."""
     (plain,) = episodes(1, size=(16, 16), smooth=True, seed=number)
     return dataclasses.replace(
         plain,
@@ -172,7 +172,7 @@ def whole(number: int) -> NewEpisode:
 
 
 def ending(table: pa.Table, episode: int, later_s: float) -> pa.Table:
-    """The same episodes, of which one's video ends later."""
+    """The same episodes, with one episode's video ending later."""
     name = "videos/observation.images.top/to_timestamp"
     ends = table[name].to_pylist()
     ends[episode] += later_s
@@ -180,7 +180,7 @@ def ending(table: pa.Table, episode: int, later_s: float) -> pa.Table:
 
 
 def timed(table: pa.Table, episode: int, times: np.ndarray) -> pa.Table:
-    """The same frames, those of one episode at these times."""
+    """The same frames, with those of one episode at these times."""
     own = np.array(table["timestamp"].to_pylist(), np.float32)
     own[np.array(table["episode_index"].to_pylist()) == episode] = times
     return replaced(table, "timestamp", pa.array(own))
@@ -213,7 +213,7 @@ def test_a_reduction_averages_over_what_it_leaves_out(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems charge for a private mapping")
 def test_frames_need_not_fit_into_memory(tmp_path: Path) -> None:
-    """A sparse file of more frames than there is memory for, of which one is read and written."""
+    """A sparse file with more frames than fit in memory; one is read and written."""
     memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     count = 2 * memory // (256 * 256 * 3) + 1
     path = tmp_path / "frames.npy"

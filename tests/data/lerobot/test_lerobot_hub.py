@@ -1,4 +1,4 @@
-"""A dataset of the hub goes by its id wherever a path would do."""
+"""A dataset of the hub can be given by its id wherever a path can."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ NAME = "someone/arm"
 
 
 def ask_anew() -> None:
-    """As in a new process, which has asked the hub for nothing yet."""
+    """As in a new process that has not asked the hub yet."""
     download._snapshot.cache_clear()
 
 
@@ -53,7 +53,7 @@ def test_it_is_read_as_the_folder_is(hosted: DatasetHub) -> None:
     assert one.sha256 == other.sha256 and torch.equal(one.frames[0], other.frames[0])
     assert demonstrations.digest(Path(NAME)) == one.sha256
     assert demonstrations.count_episodes(Path(NAME)) == 8
-    # The meta folder comes first, and the hub is asked once in a process.
+    # The meta folder comes first, and the hub is asked once per process.
     top = [f"videos/{chunk}observation.images.top/*" for chunk in ("", "*/")]
     assert hosted.asked == [["meta/*"], ["meta/*", "data/*", *top]]
     assert not (hosted.local / "weights.bin").exists()
@@ -67,7 +67,7 @@ def test_a_training_and_an_evaluation_take_its_id(
     code, out, _ = aegis("evaluate", "runs/x", "--demos", NAME, "--json")
     report = json.loads(out)
     assert code == 0 and report["data"] == NAME
-    # They are known to be those that the run was trained on.
+    # They are recognised as those on which the run was trained.
     assert report["split"] == "validation" and 0 < len(report["episodes"]) < 8
     code, out, _ = aegis("inspect", "runs/x", "--json")
     assert code == 0 and json.loads(out)["facts"]["dataset"] == NAME
@@ -167,7 +167,7 @@ def films(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> DatasetHub:
-    """A dataset of five episodes of two cameras, with files of one episode each."""
+    """A dataset of five episodes with two cameras, in files of one episode each."""
     monkeypatch.setattr(write, "_MB", 0)
     made = episodes(5, ("top", "wrist"), (64, 64), smooth=True)
     hosted.repository = save(tmp_path / "films", made, as_video=True)
@@ -184,7 +184,7 @@ def test_files_of_other_episodes_stay_where_they_are(films: DatasetHub) -> None:
     assert torch.equal(found.frames[0][found.read], here.frames[0][here.read])
     kinds = [len(list(films.local.rglob(name))) for name in ("data/**/*.parquet", "*.mp4")]
     assert kinds == [2, 2]
-    # Others come when they are asked for.
+    # Others are downloaded when they are requested.
     assert len(demonstrations.load(Path(NAME), None, 0, Selection("top")).read) > len(found.read)
     assert len(list(films.local.rglob("*.mp4"))) == 2 + 5
 
@@ -200,7 +200,7 @@ def test_of_very_many_files_all_are_downloaded(
 def test_rows_that_are_in_another_file_than_the_meta_folder_says_are_found(
     hosted: DatasetHub, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """So it was in LeRobot's converter from v2.1 until 0.5.0."""
+    """LeRobot's converter from v2.1 did this until 0.5.0."""
     monkeypatch.setattr(write, "_MB", 0)
     made = episodes(5, size=(64, 64), smooth=True)
     hosted.repository = save(tmp_path / "films", made, as_video=True)

@@ -66,7 +66,7 @@ def test_the_table_has_a_line_a_number(aegis: Any, tmp_path: Path) -> None:
 
 
 def test_an_array_has_one_line(aegis: Any, tmp_path: Path) -> None:
-    """LeRobot has depth maps in rows too, with statistics of each pixel."""
+    """LeRobot may have depth maps in its rows too, with statistics of each pixel."""
     folder = save(tmp_path / "d")
     depth = {"dtype": "uint16", "shape": [480, 640], "names": None}
     edit_info(folder, lambda info: info["features"].update({"observation.depth": depth}))
@@ -148,7 +148,7 @@ def test_the_sheet_shows_episodes_ends_from_every_camera(
 
 
 def test_recorded_demonstrations_are_a_dataset_of_their_task(aegis: Any, tmp_path: Path) -> None:
-    """What is recorded does not depend on how it is kept, and equal arguments give equal bytes."""
+    """The recording does not depend on the format, and equal arguments give equal bytes."""
     args = ("demos", "point", "--episodes", 3, "--format", "lerobot", "--json")
     code, out, _ = aegis(*args, "--out", tmp_path / "d", "--preview", tmp_path / "p.png")
     report = json.loads(out)

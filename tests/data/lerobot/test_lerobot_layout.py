@@ -1,4 +1,4 @@
-"""What is written follows the rules of LeRobot's format v3.0, and comes back as it was."""
+"""Written data follows the rules of LeRobot's format v3.0, and is read back unchanged."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ FIGURES = {"min", "max", "mean", "std", "count", "q01", "q10", "q50", "q90", "q9
 
 @pytest.fixture
 def tiny_files(monkeypatch: pytest.MonkeyPatch) -> int:
-    """A megabyte has few bytes, so that few frames fill several files."""
+    """Make a megabyte a few bytes, so that few frames fill several files."""
     monkeypatch.setattr(write, "_MB", 15_000)
     return 15_000
 
@@ -66,7 +66,7 @@ def episode_rows(folder: Path) -> list[dict[str, Any]]:
 
 
 def check_data(folder: Path, limit: int) -> None:
-    """Rows are numbered through, and an episode's are together, in one row group of its file."""
+    """Rows are numbered without gaps, and each episode's rows are in one row group of its file."""
     info, listed, start = meta(folder), episode_rows(folder), 0
     files = {path: parquet.ParquetFile(path) for path in data_files(folder)}
     table = pa.concat_tables([file.read() for file in files.values()]).to_pydict()
@@ -102,11 +102,11 @@ def check_data(folder: Path, limit: int) -> None:
         )
         assert written < limit * 1.5 or len(groups) == 1, (
             path
-        )  # what a row takes is foreseen by the mean
+        )  # a row's size is estimated by the mean
 
 
 def check_places(places: list[tuple[int, int]], per_chunk: int) -> None:
-    """Files are counted within their chunk, none is skipped."""
+    """Files are numbered within their chunk, without gaps."""
     numbers = [chunk * per_chunk + file for chunk, file in places]
     assert numbers == sorted(numbers) and set(numbers) == set(range(numbers[-1] + 1))
     assert all(file < per_chunk for _, file in places)
@@ -291,9 +291,9 @@ def test_equal_episodes_give_equal_bytes(tmp_path: Path) -> None:
 
 
 def test_what_other_writers_do_differently(tmp_path: Path) -> None:
-    """The layouts that other writers use are read too.
+    """The layouts of other writers are read too.
 
-    They have lists of any length, float64, large row groups, an unnamed pandas index, several
+    They have lists of variable length, float64, large row groups, an unnamed pandas index, several
     episode files, or no statistics.
     """
     made = episodes(6)
@@ -383,7 +383,7 @@ def test_an_empty_folder_is_filled_and_another_left_alone(tmp_path: Path) -> Non
     [
         (["dx", "dy"], ("dx", "dy")),
         ({"motors": ["dx", "dy"]}, ("dx", "dy")),
-        ({"dy": 1, "dx": 0}, ("dx", "dy")),  # LeRobot's teleoperators that move the hand
+        ({"dy": 1, "dx": 0}, ("dx", "dy")),  # as in LeRobot's teleoperators that move the hand
         ({"dx": 0, "dy": 2}, ("", "")),
         ({"dx": 0, "dy": 1, "dz": 2}, ("", "")),
         ({"dx": 0, "dy": 0}, ("", "")),

@@ -1,4 +1,4 @@
-"""Which files are read for which episodes, whatever the meta folder says of their rows."""
+"""Which files are read for which episodes, whatever the meta folder says about their rows."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ EPISODES = "meta/episodes/chunk-000/file-000.parquet"
 
 @pytest.fixture(autouse=True)
 def _small_files(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Some files of a few episodes each, and parts of a few frames."""
+    """Several files of a few episodes each, and parts of a few frames."""
     monkeypatch.setattr(write, "_MB", 8_000)
     monkeypatch.setattr(camera_frames, "_PART", 4)
 
@@ -55,7 +55,7 @@ def loaded(folder: Path, **options: Any) -> Demonstrations:
 
 
 def assert_equal(one: Demonstrations, other: Demonstrations, at: torch.Tensor) -> None:
-    """The two have read the same at these frames."""
+    """The two have read the same data at these frames."""
     assert torch.equal(one.frames[0][at], other.frames[0][at])
     for name in ("proprio", "actions"):
         assert torch.equal(one.tensors[name][at], other.tensors[name][at])
@@ -67,7 +67,7 @@ def frames_of(found: Demonstrations, numbers: set[int]) -> torch.Tensor:
 
 
 def lay_out(folder: Path, cuts: list[int]) -> None:
-    """Share the rows anew: a file of the episodes up to each cut."""
+    """Divide the rows again: one file with the episodes up to each cut."""
     table = pa.concat_tables([parquet.read_table(path) for path in data_files(folder)])
     for path in data_files(folder):
         path.unlink()
@@ -78,9 +78,9 @@ def lay_out(folder: Path, cuts: list[int]) -> None:
 
 
 def name_as_the_older_converter(folder: Path, cuts: list[int]) -> None:
-    """Let the first episode of each later file be in the file before it, as the meta folder says.
+    """Make the meta folder say that each later file's first episode is in the file before it.
 
-    So did LeRobot's converter from v2.1 until 0.5.0.
+    LeRobot's converter from v2.1 did this until 0.5.0.
     """
     files = np.searchsorted(cuts, np.arange(COUNT), side="right")
     files[cuts] -= 1
@@ -113,7 +113,7 @@ def test_files_in_another_order_are_read(folder: Path) -> None:
 
 
 def test_a_sound_datasets_digest_is_of_the_files_that_its_meta_folder_names(folder: Path) -> None:
-    """Runs that began before the rows were asked go on."""
+    """Runs from before the rows were checked can resume."""
     found = dataset.load(folder)
     camera = found.info.cameras[0]
     named = {episode.data for episode in found.episodes}
@@ -209,7 +209,7 @@ def test_rows_are_found_in_row_groups_of_any_size(
 
 
 def test_files_of_other_episodes_need_not_be_there(folder: Path) -> None:
-    """As where LeRobot or the hub's client has downloaded some episodes."""
+    """As after a partial download by LeRobot or by the hub's client."""
     whole = loaded(folder)
     lay_out(folder, [3, 8])
     digest = loaded(folder, selection=only({3, 4, 7})).sha256
@@ -246,7 +246,7 @@ def test_numbers_of_other_episodes_need_not_be_finite(folder: Path) -> None:
 
 
 def test_some_episodes_frames_are_no_other_episodes(folder: Path, frame_cache: Path) -> None:
-    """They have one digest where one file holds them all, and files of their own in the cache."""
+    """If one file holds all of them, their digest is the same, but each has its own cached file."""
     lay_out(folder, [])
     one, other = (loaded(folder, selection=only(chosen)) for chosen in ({1, 5}, {2, 5}))
     whole = loaded(folder)
@@ -291,7 +291,7 @@ def test_several_features_are_joined_in_their_order(folder: Path) -> None:
 
 
 def arms(folder: Path, names: dict[str, str]) -> None:
-    """State and action twice, once for each arm, with the same names of joints."""
+    """State and action twice, once for each arm, with the same joint names."""
     for path in data_files(folder):
 
         def doubled(table: pa.Table) -> pa.Table:
@@ -318,7 +318,7 @@ def test_joints_of_one_name_in_several_features_are_told_apart(folder: Path) -> 
     assert found.proprio_names == ("left.x", "left.y", "left.z", "right.x", "right.y", "right.z")
     assert found.action_names == ("left.x", "left.y", "right.x", "right.y")
     assert found.relative_places(()) == (0, 1, 3, 4)
-    # LeRobot's own features keep their names: what is beside them is something else of the joints.
+    # LeRobot's own features keep their names: what is beside them is another value of the joints.
     found = loaded(folder, selection=Selection(state=("observation.left", "observation.state")))
     assert found.proprio_names == ("left.x", "left.y", "left.z", "x", "y", "z")
     assert found.relative_places(()) == (3, 4)
@@ -350,7 +350,7 @@ def nameless(folder: Path, feature: str) -> None:
 
 
 def test_names_and_rate_are_kept_as_far_as_the_data_says_them(folder: Path) -> None:
-    """Of a feature without names there are none."""
+    """A feature without names has none."""
     found = loaded(folder)
     names = {"action_names": ["dx", "dy"], "proprio_names": ["x", "y", "z"]}
     assert found.recorded == names | {"fps": 10.0}

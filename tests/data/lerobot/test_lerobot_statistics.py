@@ -34,7 +34,7 @@ def test_a_quantile_is_the_value_that_its_share_lies_below_within_a_bin(length: 
 
 
 def test_mean_and_deviation_do_not_cancel() -> None:
-    """E[x^2] - E[x]^2 in float32, which is what LeRobot computes, gives 0 or nonsense here."""
+    """In float32, E[x^2] - E[x]^2, which LeRobot computes, gives 0 or nonsense here."""
     rows = (1000 + 0.1 * np.random.default_rng(0).normal(size=(500, 1))).astype(np.float32)
     np.testing.assert_allclose(
         statistics.of_vectors(rows)["std"], rows.astype(np.float64).std(0), rtol=1e-9
@@ -91,6 +91,6 @@ def test_merged_figures_are_those_of_all_rows_together(seed: int) -> None:
         np.testing.assert_allclose(merged[name], together[name], rtol=1e-9)
     for name in merged:
         np.testing.assert_allclose(in_steps[name], merged[name], rtol=1e-9)
-    for name, share in QUANTILES.items():  # an envelope, as LeRobot's
+    for name, share in QUANTILES.items():  # an envelope, as in LeRobot
         pick = np.min if share <= 0.5 else np.max
         np.testing.assert_array_equal(merged[name], pick([one[name] for one in separate], axis=0))

@@ -1,4 +1,4 @@
-"""LeRobot folders as demonstrations: the same training as from a file, however decoded."""
+"""LeRobot folders as demonstrations: the same training as from a file, whatever the decoding."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ BOTH = ("top", "wrist")
 
 @pytest.fixture(scope="session")
 def reach_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The episodes of `demos_file`, as a LeRobot dataset."""
+    """The episodes of `demos_file` as a LeRobot dataset."""
     path = tmp_path_factory.mktemp("demos") / "reach"
     record.run("reach", 8, 0, path, workers=1, form="lerobot")
     return path
@@ -116,7 +116,7 @@ def test_a_rate_may_be_off_a_little_and_a_recording_may_have_gaps(tmp_path: Path
 
 
 def _with_a_gap(column: pa.ChunkedArray) -> pa.Array:
-    """The times of an episode's first five frames, of which the last comes a second later."""
+    """The times of an episode's first five frames; the last one is a second later."""
     times = column.to_numpy().copy()
     times[4] += 1
     return pa.array(times)
@@ -285,7 +285,7 @@ def test_a_cache_that_cannot_be_is_one_error(
 
 @pytest.fixture
 def filmed(tmp_path: Path) -> Path:
-    """Two cameras' videos, each in several files of several episodes."""
+    """Videos of two cameras, each in several files with several episodes."""
     made = episodes(9, BOTH, (16, 32), smooth=True)
     return save(tmp_path / "d", made, Limits(video_mb=0), as_video=True)
 
@@ -294,14 +294,14 @@ def filmed(tmp_path: Path) -> Path:
 def test_frames_on_demand_are_those_of_the_cache(
     side: int | None, filmed: Path, frame_cache: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(video, "_KEPT_OPEN", 2)  # fewer than there are, so some open again
+    monkeypatch.setattr(video, "_KEPT_OPEN", 2)  # fewer than there are, so some are opened again
     asked = demonstrations.load(filmed, 0.3, 0, Selection(BOTH), side, cache=False)
     assert not (frame_cache / "frames").exists() and len(set(filmed.rglob("*.mp4"))) > 4
     kept = demonstrations.load(filmed, 0.3, 0, Selection(BOTH), side)
     assert [frames.shape for frames in asked.frames] == [frames.shape for frames in kept.frames]
     rng = np.random.default_rng(0)
     for _ in range(8):
-        numbers = rng.integers(0, len(kept.episode_of), 16)  # in any order, some of them twice
+        numbers = rng.integers(0, len(kept.episode_of), 16)  # in any order, some repeated
         one, other = asked.batch(numbers, 3), kept.batch(numbers, 3)
         for seen, wanted in zip(one.images, other.images, strict=True):
             assert all(torch.equal(*pair) for pair in zip(seen, wanted, strict=True))
@@ -337,12 +337,12 @@ def test_pictures_in_data_files_are_kept_whatever_was_asked_for(
 def test_a_video_that_changes_while_frames_are_asked_for_ends_the_training(
     filmed: Path, tmp_path: Path
 ) -> None:
-    """Its frames would be others, under the digest of the first ones."""
+    """Its frames would be different, under the digest of the first ones."""
     demos = demonstrations.load(filmed, 0.3, 0, Selection(BOTH), cache=False)
     demos.check_files()
     first, *_, last = sorted(filmed.rglob("*.mp4"))
     shutil.copyfile(first, tmp_path / "other.mp4")
-    (tmp_path / "other.mp4").rename(last)  # as a tool would that writes aside
+    (tmp_path / "other.mp4").rename(last)  # like a tool that writes a new file and renames it
     with pytest.raises(AegisError, match=f"{last.name}' was written to"):
         demos.check_files()
     last.unlink()
@@ -374,7 +374,7 @@ def test_a_full_disk_is_told_of_frames_on_demand(
 def test_frames_stay_in_their_videos_where_the_disk_has_little_room(
     filmed: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Unless they are kept already; unasked, they take a quarter of what is free."""
+    """Unless they are cached already; by default they take up to a quarter of the free space."""
     selection, events = Selection("top"), list[Event]()
 
     def loaded(free: int) -> Demonstrations:
@@ -406,7 +406,7 @@ def test_frames_stay_in_their_videos_where_the_disk_has_little_room(
 def test_a_run_of_frames_on_demand_has_the_weights_of_one_of_kept_ones(
     start: Start, recipe: Recipe, frame_cache: Path, tmp_path: Path
 ) -> None:
-    """It may also be resumed with them."""
+    """It can also be resumed with them."""
     film = tmp_path / "film"
     record.run("reach", 8, 0, film, workers=1, form="lerobot", as_video=True)
     asked = replace(recipe, demos=Demos(cache=False))
@@ -462,7 +462,7 @@ def test_several_threads_work_at_once_and_their_results_keep_their_order() -> No
     together = threading.Barrier(3, timeout=60)
 
     def met(index: int) -> int:
-        together.wait()  # which it does only once all three are here
+        together.wait()  # this returns only once all three are here
         return index
 
     with prefetch.ahead(met, range(9), depth=3, workers=3) as results:
@@ -579,7 +579,7 @@ def test_quantiles_come_from_the_training_episodes_and_stay_with_the_expert(
 def test_a_recipe_names_its_demonstrations(tiny_folder: Path, tmp_path: Path) -> None:
     """A robot that Aegis does not simulate: its policy is trained, probed and evaluated open-loop.
 
-    It is never rolled out. Its stages are up to date until the data change.
+    It is never rolled out. Its stages stay up to date until the data change.
     """
     folder = save(
         tmp_path / "d", [replace(e, instruction="go to the red pad") for e in episodes(4, BOTH)]
@@ -598,14 +598,14 @@ def test_a_recipe_names_its_demonstrations(tiny_folder: Path, tmp_path: Path) ->
     run = tmp_path / "runs" / "small" / "naive"
     alone = open_loop.run(run, folder)
     assert (row.open_loop_error, alone.split) == (alone.relative_error, "validation")
-    assert row.hold_error is alone.hold_error is None  # these actions are no positions
+    assert row.hold_error is alone.hold_error is None  # these actions are not positions
     (kept,) = results.open_loops(run)
     assert kept.figures["relative_interval"] == alone.relative_interval
     progress = [e for e in events if isinstance(e, Progress)]
     ended = [e.metrics for e in progress if e.unit == "method" and e.done]
     assert [figures["open-loop error"] for figures in ended] == [row.open_loop_error]
     open_loop.run(run, folder, keep=True)
-    assert results.open_loops(run) == [kept]  # the same measurement once more
+    assert results.open_loops(run) == [kept]  # measured again, with the same result
     events.clear()
     pipeline.run(given, tmp_path / "runs", events.append)
     work = {e.stage for e in events if e.unit not in ("method", "methods")}
@@ -656,6 +656,6 @@ def test_a_policy_of_no_simulated_task_plays_one_that_fits(
     assert "6 positions and 2 actions for task 'point'" in err
     played = aegis("rollout", tmp_path / "run", "--task", "reach", "--episodes", 1, "--json")
     assert played[0] == 0 and json.loads(played[1])["task"] == "reach"
-    assert "warning" not in played[2]  # its steps are as long as the training's
+    assert "warning" not in played[2]  # its steps are as long as in training
     code, out, _ = aegis("inspect", tmp_path / "run", "--json")
     assert code == 0 and json.loads(out)["facts"]["task"] is None

@@ -1,4 +1,4 @@
-"""Datasets of versions 2.0 and 2.1 are read as the same dataset of version 3.0 is."""
+"""Datasets of versions 2.0 and 2.1 are read like the same dataset of version 3.0."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def newer(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.Mo
 
 @pytest.fixture(params=["v2.0", "v2.1"])
 def older(request: pytest.FixtureRequest, newer: Path) -> Path:
-    """The same as a dataset of an older version."""
+    """The same dataset in an older version."""
     return as_version_2(shutil.copytree(newer, newer.with_name("older")), request.param)
 
 
@@ -94,7 +94,7 @@ def test_inspect_says_the_same(aegis: Any, newer: Path, older: Path, tmp_path: P
     for one, other in zip(said[0]["features"], said[1]["features"], strict=True):
         ones, others = one.pop("statistics"), other.pop("statistics")
         assert one == other
-        # Version 2.1 has the figures of episodes, and no quantiles.
+        # Version 2.1 has statistics of episodes, and no quantiles.
         assert others.keys() == (ones.keys() if version == "v2.0" else FIGURES)
         for name, figures in others.items():
             np.testing.assert_allclose(figures, ones[name], rtol=1e-12)
@@ -130,7 +130,7 @@ def test_a_training_and_an_evaluation_take_it(aegis: Any, place: Path) -> None:
 
 
 def test_names_of_another_count_name_no_number(aegis: Any, place: Path) -> None:
-    """openpi's LIBERO calls eight positions `state`."""
+    """openpi's LIBERO data has a single name, `state`, for eight positions."""
     save(place / "d", episodes(COUNT))
     as_version_2(place / "d", "v2.0")
 

@@ -1,4 +1,4 @@
-"""Demonstrations of LIBERO's, which do not say that they are: the recipe's task does."""
+"""Demonstrations of LIBERO, which do not say that they are: the recipe's task says it."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ ONE = ("image",)
 
 
 def libero(folder: Path, cameras: tuple[str, ...] = ONE, positions: int = 8) -> Path:
-    """A data set with the columns of LIBERO's, of some robot's type."""
+    """A data set with LIBERO's columns, of some robot's type."""
     rng = np.random.default_rng(0)
     made = [
         dataclasses.replace(
@@ -49,7 +49,7 @@ def libero(folder: Path, cameras: tuple[str, ...] = ONE, positions: int = 8) -> 
 
 
 def of(recipe: Recipe, **demos: Any) -> Recipe:
-    """The recipe for LIBERO's tasks, with keys of its demonstrations."""
+    """The recipe for LIBERO's tasks, with changed keys of its demonstrations."""
     return dataclasses.replace(recipe, task="libero/object", demos=Demos(**demos))
 
 
@@ -99,11 +99,11 @@ def test_cameras_of_other_names_are_refused_until_they_are_renamed(
     assert "'demos.rename={front: image, hand: image2}'" in caught.value.fix
     renamed = {"front": "image", "hand": "wrist_image"}
     assert load(camera=("image", "wrist_image"), rename=renamed).task == "libero/object"
-    assert load(camera="front").task == "libero/object"  # whatever the only camera is called
+    assert load(camera="front").task == "libero/object"  # whatever the name of its only camera
 
 
 def test_a_camera_that_is_renamed_away_is_still_the_tasks(tmp_path: Path) -> None:
-    """As SmolVLA's names, which LIBERO does not know."""
+    """For example SmolVLA's names, which LIBERO does not know."""
     folder = libero(tmp_path / "d", ("image", "image2"))
     rename = {"image": "camera1", "image2": "camera2"}
     seen_by = ("camera1", "camera2")
@@ -113,7 +113,7 @@ def test_a_camera_that_is_renamed_away_is_still_the_tasks(tmp_path: Path) -> Non
 
 
 def test_a_stream_learns_suite_after_suite(tiny_folder: Path, tmp_path: Path) -> None:
-    """Each task has a data set, of which the recipe chooses camera and features."""
+    """Each task has a data set; the recipe chooses its camera and features."""
     paths = tuple(str(libero(tmp_path / name, ("image", "image2"))) for name in ("a", "b"))
     recipe = RobotStreamRecipe(
         name="x",
@@ -140,7 +140,7 @@ def test_a_stream_learns_suite_after_suite(tiny_folder: Path, tmp_path: Path) ->
 
 
 def test_what_a_stream_reads_of_its_data_tells_its_runs_and_cells_apart() -> None:
-    """The digest of the files says nothing of it. Runs from before there was the key go on."""
+    """The digest of the files does not show it. Runs from before the key existed can resume."""
     recipe = RobotStreamRecipe(
         name="x", tasks=("libero/object",), backbone="b", demos=RobotDemos(paths=("a",))
     )
@@ -152,7 +152,7 @@ def test_what_a_stream_reads_of_its_data_tells_its_runs_and_cells_apart() -> Non
 
 
 def test_a_policy_of_one_suite_acts_in_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rollout.sim, "check", lambda _: None)  # which would want LIBERO
+    monkeypatch.setattr(rollout.sim, "check", lambda _: None)  # which would need LIBERO
     policy = cast(Policy, None)
     for asked in ("libero/goal", "libero/object-3", "libero/all"):
         assert rollout._task(policy, "libero/object", asked) == asked
@@ -177,7 +177,7 @@ def test_one_that_knows_no_task_is_told_of_one_that_may_fit(
 def test_ten_steps_a_second_are_liberos_too(
     rate: float, warned: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its simulator takes twenty, and the usual copies of its demonstrations say ten."""
+    """Its simulator runs at twenty, and the usual copies of its demonstrations state ten."""
     monkeypatch.setattr(rollout.sim, "make", lambda name: SimpleNamespace(spec=table.spec(name)))
     events: list[Any] = []
     rollout._check_rate(rate, "libero/object", events.append)

@@ -1,4 +1,4 @@
-"""An observation in one mapping: what is read of LeRobot's, and of what a robot gives."""
+"""An observation in one mapping: what is read from LeRobot's, and from a robot's own."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ STATE = np.array([1.5, -2.0, 3.0], np.float32)
 
 
 def tensor(shown: np.ndarray) -> torch.Tensor:
-    """As LeRobot's own preprocessing gives a picture."""
+    """The picture as LeRobot's own preprocessing passes it."""
     return torch.from_numpy(shown).permute(2, 0, 1).float() / 255
 
 
@@ -172,9 +172,9 @@ def test_a_motor_that_gives_no_number_is_named(value: Any) -> None:
 @pytest.mark.parametrize(
     ("value", "told"),
     [
-        (None, "'top' is NoneType"),  # as a camera gives that has no frame yet
+        (None, "'top' is NoneType"),  # as from a camera that has no frame yet
         (Image.fromarray(TOP), "'top' is Image"),
-        (TOP.reshape(-1), r"'top' is ndarray of shape \(144,\)"),  # as of a compressed one
+        (TOP.reshape(-1), r"'top' is ndarray of shape \(144,\)"),  # as from a compressed one
         ("frame.png", "'top' is str"),
     ],
 )
@@ -188,7 +188,7 @@ def test_a_camera_that_gives_no_picture_is_named(value: Any, told: str) -> None:
     ("state", "given", "wanted"),
     [
         (("observation.ee",), {"observation.ee": STATE, "observation.state": -STATE}, STATE),
-        (("observation.ee",), {"observation.state": STATE}, STATE),  # as a robot's program has it
+        (("observation.ee",), {"observation.state": STATE}, STATE),  # as in a robot's own program
         (
             ("observation.state", "observation.ee"),
             {"observation.ee": torch.tensor([[7.0]]), "observation.state": torch.tensor(STATE)},

@@ -134,7 +134,7 @@ def test_another_version_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_its_state_is_the_same_on_every_machine(source: sets.EasyVqa) -> None:
-    """A cell's key holds it, so that times of files must not be in it."""
+    """A cell's key contains it, so file times must not."""
     (name, digests), *more = source.state.items()
     assert name == "question_files" and not more
     assert {key: value[:16] for key, value in digests.items()} == {

@@ -1,4 +1,4 @@
-"""Grading: intervals against figures worked out by hand, and what a known answerer scores."""
+"""Grading: intervals against hand-computed values, and the scores of a known answerer."""
 
 from __future__ import annotations
 
@@ -57,16 +57,16 @@ def questions(family: str, answers: str) -> list[Question]:
 
 
 def test_majority_share_is_taken_in_each_family() -> None:
-    """The baseline gives a family's commonest answer: 3 of 4 and 2 of 4 are right.
+    """The baseline gives a family's most common answer: 3 of 4 and 2 of 4 are right.
 
-    No answer is common over all.
+    No answer is the most common over all.
     """
     assert majority_share(questions("a", "xxxy") + questions("b", "yyxz")) == 5 / 8
     assert majority_share(questions("a", "x")) == 1
 
 
 def graded(family: str, correct: str, cross_entropy: float = 1.0) -> list[Graded]:
-    """Answers to a question about each of so many images."""
+    """Answers to one question about each of this many images."""
     return [
         Graded(Question(family, "q", c), c, c == "1", cross_entropy, image)
         for image, c in enumerate(correct)
@@ -78,7 +78,7 @@ def test_an_accuracys_interval_counts_an_image_once_whose_questions_end_alike(co
     rng = np.random.default_rng(copies)
     ends = "".join(rng.choice(["0", "1", "1"], 200))
     rows = [row for row in graded("where", ends) for _ in range(copies)]
-    effect = (200 * copies - 1) / 199  # as many copies, but for the degrees of freedom
+    effect = (200 * copies - 1) / 199  # that many copies, up to the degrees of freedom
     hits = ends.count("1") * copies
     wanted = wilson_interval(hits / effect, 200 * copies / effect)
     assert score(rows).interval == pytest.approx(wanted, abs=1e-9)
@@ -97,7 +97,7 @@ def test_score_and_families() -> None:
 
 
 class Answerer:
-    """Reads the answer off the image's first pixel.
+    """Reads the answer from the image's first pixel.
 
     Its surprise in nats is the number of words in the text.
     """
@@ -142,14 +142,14 @@ def test_grade_asks_each_question_of_its_image_once() -> None:
 
 
 def test_the_bootstraps_width_is_that_of_the_normal_interval() -> None:
-    """One question an image and many images: the mean's percentiles are 1.96 deviations away."""
+    """With one question per image and many images, the percentiles are at 1.96 deviations."""
     values = np.random.default_rng(0).random(4000).tolist()
     low, high = bootstrap_interval(values, range(4000))
     half = 1.96 * np.std(values) / math.sqrt(4000)
     assert (low, high) == pytest.approx(
         (np.mean(values) - half, np.mean(values) + half), abs=0.1 * half
     )
-    assert bootstrap_interval(values, range(4000)) == (low, high)  # the same draws every time
+    assert bootstrap_interval(values, range(4000)) == (low, high)  # the same draws each time
     assert bootstrap_interval(values, range(4000), seed=1) != (low, high)
 
 
@@ -168,10 +168,10 @@ def test_asking_an_image_again_adds_no_certainty(copies: int) -> None:
 
 
 def test_images_of_many_questions_weigh_more() -> None:
-    """Nine questions about an image that is always right, and one each about nine that are not."""
+    """Nine questions about one image are always right, one each about nine other images is not."""
     values, image_of = [1.0] * 9 + [0.0] * 9, [0] * 9 + list(range(1, 10))
     low, high = bootstrap_interval(values, image_of)
-    assert low == 0 and 0.6 < high < 0.9  # without the image 0; with it three times or four
+    assert low == 0 and 0.6 < high < 0.9  # 0 without the image; with it three or four times
 
 
 def by_people(hits: str, image_of: range | list[int], said: str = "red") -> list[Graded]:
@@ -186,7 +186,7 @@ def test_a_score_of_peoples_answers() -> None:
     rows = by_people("1101", [0, 0, 1, 1])
     total = score(rows)
     assert (total.accuracy, total.soft_accuracy) == (0.75, 0.375)
-    assert total.interval == wilson_interval(3, 4)  # as unlike as questions about several images
+    assert total.interval == wilson_interval(3, 4)  # as unlike as questions about different images
     alike = score(by_people("1100", [0, 0, 1, 1]))
     assert alike.interval == pytest.approx(wilson_interval(2 / 3, 4 / 3))
     assert total.soft_interval == (0.25, 0.5)
@@ -201,13 +201,13 @@ def test_a_score_of_peoples_answers() -> None:
 def test_the_drop_of_peoples_answers_is_paired_by_question_and_drawn_by_image() -> None:
     image_of = [i // 2 for i in range(40)]
     after, before = by_people("10" * 20, image_of), by_people("11" * 20, image_of)
-    # Each image loses one of its two questions: they count as if they were independent.
+    # Each image loses one of its two questions: they count as independent.
     share, bound = wilson_interval(20, 40), wilson_interval(0, 40)[1]
     low, high = drop_interval(before, after)
     assert (0.5 - low) ** 2 == pytest.approx((0.5 - share[0]) ** 2 + bound**2)
     assert high == pytest.approx(share[1])
     assert drop_interval(after, after) == pytest.approx((-bound, bound))
-    # Every second image loses both of its questions, which count half.
+    # Every second image loses both of its questions, which count as one.
     spread = drop_interval(before, by_people("1100" * 10, image_of))
     assert spread[0] < low and spread[1] > high
     effect = 39 / 19
@@ -281,9 +281,9 @@ def test_a_line_of_predictions() -> None:
 
 @pytest.mark.parametrize("images", [1, 8, 500])
 def test_answers_that_are_all_alike_are_no_certainty(images: int) -> None:
-    """The bootstrap of one value is a point, and so is the normal interval.
+    """The bootstrap of a single value is a point, and so is the normal interval.
 
-    Wilson's is not, and an image's is wide.
+    Wilson's interval is not, and is wide for one image.
     """
     right, wrong = by_people("1" * images, range(images)), by_people("0" * images, range(images))
     assert score(right).interval == pytest.approx(wilson_interval(images, images))

@@ -1,4 +1,4 @@
-"""Packing: what goes in comes back, and a mirrored scene gets the answers of a mirrored scene."""
+"""Packing: inputs are recovered, and a mirrored scene gets the answers of a mirrored scene."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_shares_are_cut_to_their_longest_block_and_lose_nothing(scenes) -> None:
 
 
 def mirrored(scene: Scene) -> Scene:
-    """The scene in a mirror, from its things: independent of the token maps."""
+    """The mirrored scene, built from its things: independent of the token maps."""
     return Scene(
         scene.image[:, ::-1], tuple(replace(t, x_px=IMAGE_SIZE - t.x_px) for t in scene.things)
     )
@@ -67,7 +67,7 @@ def test_a_mirrored_scenes_answers_are_true_and_the_others_are_left_alone(scenes
     turned, blocks = mirror(images, packed.ids, packed.prompt_length, flip, mirror_words(WORDS))
     assert np.array_equal(packed.ids, before[0]) and np.array_equal(
         images, before[1]
-    )  # the set itself stays
+    )  # the set itself is unchanged
     assert np.array_equal(blocks[~flip], packed.ids[~flip]) and np.array_equal(
         turned[~flip], images[~flip]
     )

@@ -1,4 +1,4 @@
-"""Scenes, questions and sets of them: pictures show what labels say, and answers are true."""
+"""Scenes, questions and sets of them: pictures match their labels, and answers are true."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ from aegis_cli.models.backbones.embedded import MAX_ANSWER, MAX_TEXT
 from aegis_cli.models.backbones.tokenizer import Tokenizer
 from aegis_cli.pretraining.vlm import BLOCK_TOKENS
 
-# Over 300 scenes the commonest answer of a family may not exceed this share: chance is 1/8, 1/3,
-# 1/4, ... 1/64.
+# Over 300 scenes the most common answer of a family may not exceed this share: chance is 1/8,
+# 1/3, 1/4, ... 1/64.
 MOST = {
     "color": 0.16,
     "shape": 0.38,
@@ -54,7 +54,7 @@ def one_each() -> VQASet:
 
 
 def hue_of(rgb: np.ndarray | tuple[float, float, float]) -> str:
-    """The palette's colour of the nearest hue."""
+    """The palette's colour with the nearest hue."""
     hue = colorsys.rgb_to_hsv(*rgb)[0]
     gap = {name: abs(hue - colorsys.rgb_to_hsv(*color)[0]) for name, color in RGB.items()}
     return min(gap, key=lambda name: min(gap[name], 1 - gap[name]))
@@ -65,7 +65,7 @@ def hue_of(rgb: np.ndarray | tuple[float, float, float]) -> str:
 
 def test_a_scene_is_a_function_of_seed_split_and_index() -> None:
     first, second = SceneRenderer(), SceneRenderer()
-    second.render(scene_rng(9, "train", 9))  # what was drawn before leaves no trace
+    second.render(scene_rng(9, "train", 9))  # earlier draws leave no trace
     for index in range(5):
         a, b = (
             first.render(scene_rng(3, "probe", index)),
@@ -84,17 +84,17 @@ def test_seeds_splits_and_indices_all_give_other_scenes() -> None:
 
 
 def test_a_things_centre_shows_its_colour(scenes) -> None:
-    """Position and colour of the labels are those of the picture: no axis or thing is swapped."""
+    """The labels' positions and colours match the picture: no axis or thing is swapped."""
     shown = [
         hue_of(scene.image[int(thing.y_px), int(thing.x_px)] / 255) == thing.color
         for scene, _ in scenes
         for thing in scene.things
     ]
-    assert len(shown) > SCENES and np.mean(shown) >= 0.98  # clutter may stand before a few
+    assert len(shown) > SCENES and np.mean(shown) >= 0.98  # clutter may hide a few
 
 
 def test_the_floor_shows_where_nothing_stands(scenes) -> None:
-    """A thing covers its centre but not what is two radii away: it is as small as it says."""
+    """A thing covers its centre but nothing two radii away, as its size says."""
     alone = [scene for scene, _ in scenes if len(scene.things) == 1]
     colourful = []
     for scene in alone:
@@ -102,7 +102,7 @@ def test_the_floor_shows_where_nothing_stands(scenes) -> None:
         away = np.hypot(x - scene.things[0].x_px, y - scene.things[0].y_px) > 16
         spread = (
             np.ptp(scene.image.astype(int), axis=-1) > 90
-        )  # of a pixel's channels: floor and clutter are grey
+        )  # range over a pixel's channels: floor and clutter are grey
         colourful.append((spread & away).mean())
     assert len(alone) > 30 and np.mean(colourful) < 0.002
 
@@ -246,7 +246,7 @@ def test_image_of_points_at_the_scene_that_was_asked_about() -> None:
     things = {scene.image.tobytes(): scene.things for scene in rendered}
     assert sorted(set(made.image_of.tolist())) == list(
         range(len(made.images))
-    )  # no picture for nothing
+    )  # nothing is rendered in vain
     for row, question in zip(made.image_of, made.questions, strict=True):
         assert question.answer == truth(question, things[made.images[row].tobytes()])
 
@@ -289,7 +289,7 @@ def test_training_scenes_are_the_train_split_whole_and_in_order(scenes) -> None:
 
 
 def test_a_rendering_process_that_dies_is_one_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As where the kernel ends it for its memory: nobody waits for its scenes."""
+    """As when the kernel kills it for its memory: nothing waits for its scenes."""
     monkeypatch.setattr(dataset, "_render_chunk", os._exit)
     with pytest.raises(AegisError, match="a rendering process died"):
         list(dataset._map([1, 1, 1], 2))
@@ -311,7 +311,7 @@ def test_a_thread_has_one_renderer_whose_scenes_are_those_of_a_new_one() -> None
 def test_questions_do_not_depend_on_the_process() -> None:
     """Sets of words iterate in another order in another process; the questions must not.
 
-    Nor is anything said of the renderer at the end, where a simulator has come after it.
+    Nor does the renderer print anything at exit if a simulator has been loaded after it.
     """
     code = (
         "from aegis_cli.data.vqa.dataset import load_scenes\n"

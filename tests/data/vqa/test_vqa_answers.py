@@ -1,4 +1,4 @@
-"""The official rules of comparing answers, on cases worked out by hand."""
+"""The official rules for comparing answers, on cases worked out by hand."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ WORDS = ("red", "dog's", "t-shirt", "Two", "2", "the", "yes", "p.m.", "1,000", "
         ("yall'd've", "y'all'd've"),
         ("well", "well"),
         ("dog's", "dog's"),
-        # a mark inside a word parts it, one at its edge vanishes
+        # a mark inside a word splits it, one at its edge is removed
         ("t-shirt", "t shirt"),
         ("black/white", "black white"),
         ("red, white", "red white"),
@@ -49,7 +49,7 @@ WORDS = ("red", "dog's", "t-shirt", "Two", "2", "the", "yes", "p.m.", "1,000", "
         ("yes !", "yes"),
         ("(left) side", "left side"),
         ("what?", "what"),
-        # a comma between digits joins, and all marks with it
+        # a comma between digits joins, and so do all other marks there
         ("1,000", "1000"),
         ("1,000-2,000", "10002000"),
         # periods, but not decimal points
@@ -58,10 +58,10 @@ WORDS = ("red", "dog's", "t-shirt", "Two", "2", "the", "yes", "p.m.", "1,000", "
         ("2.5", "2.5"),
         ("u.s.a.", "usa"),
         (".5", ".5"),
-        # colons and apostrophes are no marks
+        # colons and apostrophes do not count as marks
         ("6:30", "6:30"),
         ("dogs'", "dogs'"),
-        # what would leave nothing stays
+        # if nothing would remain, it stays
         ("A", "a"),
         ("the", "the"),
         (" + ", "+"),
@@ -76,7 +76,7 @@ def test_normalisation(answer: str, compared: str) -> None:
 def test_case_spaces_and_articles_never_count() -> None:
     rng = random.Random(0)
     for _ in range(300):
-        words = [*rng.choices(WORDS, k=rng.randint(0, 3)), "cat"]  # no answer of articles alone
+        words = [*rng.choices(WORDS, k=rng.randint(0, 3)), "cat"]  # so that some word is no article
         spaced = rng.choice(("a ", "The  ", "\tan ", " ")) + "  ".join(words).upper() + "\n"
         assert normalise(spaced) == normalise(" ".join(words))
 
@@ -87,7 +87,7 @@ def test_case_spaces_and_articles_never_count() -> None:
 def test_soft_accuracy_of_ten_answers(people: int, score: float) -> None:
     """By hand, for two people of ten: (2/3 + 8 * 2/3) / 10.
 
-    To leave out one of the two leaves one, min(1/3, 1); to leave out another leaves two.
+    Without one of the two, one is left, min(1/3, 1); without one of the others, two are left.
     """
     answers = ["Red."] * people + [f"other {i}" for i in range(10 - people)]
     assert soft_accuracy("a red", answers) == pytest.approx(score)
@@ -114,7 +114,7 @@ def test_one_persons_answer_is_right_or_wrong() -> None:
     [
         (["red"], "red"),
         (["blue", "red", "red"], "red"),
-        (["blue", "red", "Red.", "blue"], "blue"),  # as common as red: the first
+        (["blue", "red", "Red.", "blue"], "blue"),  # equally common: the first one wins
         (
             ["gray", "Two", "2", "the two"],
             "Two",

@@ -98,7 +98,7 @@ def test_rows_of_a_data_set_have_conversations(
 
 
 def test_columns_of_lists_are_conversations_too(tmp_path: Path) -> None:
-    """As `datasets` gives a column that was declared as a sequence of objects."""
+    """The form in which `datasets` returns a column declared as a sequence of objects."""
     turns = FORMS["llava"]["conversations"]
     said = [{name: [turn[name] for turn in turns] for name in ("from", "value")}]
     features = datasets.Features(

@@ -1,4 +1,4 @@
-"""A question set of the hub goes by its id, and a split of it after a number sign."""
+"""A question set of the hub is given by its id, and its split after a number sign."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_a_split_is_read_and_nothing_else_is_downloaded(split: str, hosted: Data
 
 @pytest.mark.parametrize("kind", [HTTPError, OfflineModeIsEnabled, FileNotFoundError])
 def test_what_is_in_the_cache_needs_no_network(kind: type[Exception], hosted: DatasetHub) -> None:
-    """And nothing else is downloaded where the hub fails to say what it has."""
+    """And nothing else is downloaded if the hub does not answer what it has."""
     before = reread(f"{NAME}#train")
     hosted.fails = kind("no connection")
     assert reread(f"{NAME}#train").state == before.state
@@ -77,7 +77,7 @@ def test_a_probe_takes_its_id(aegis: Any, hosted: DatasetHub, place: Path) -> No
 
 
 def test_it_is_inspected_by_its_id(aegis: Any, hosted: DatasetHub, tmp_path: Path) -> None:
-    """By a split, or the only one there is; one of LeRobot's is told by its meta folder."""
+    """With a split, or its only split; one of LeRobot's is recognised by its meta folder."""
     code, out, err = aegis("inspect", f"{NAME}#validation", "--plot", tmp_path / "sheet.png")
     assert code == 0 and (tmp_path / "sheet.png").is_file(), err
     code, _, err = aegis("inspect", NAME)

@@ -1,4 +1,4 @@
-"""Question sets of files: what is read, each image's part, and what is decoded when."""
+"""Question sets in files: what is read, each image's part, and what is decoded when."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def test_a_set_has_one_name_also_from_within_its_folder(
 
 
 def test_an_image_has_one_name_however_it_is_spelt(tmp_path: Path) -> None:
-    """Another spelling of a path is no other image: it must not fall into another part."""
+    """Another spelling of a path is not another image, and must not get another part."""
     write_jsonl(tmp_path, 2)
     (tmp_path / "images/link.png").symlink_to("0.png")
     spellings = [
@@ -208,7 +208,7 @@ def test_a_data_set_of_hugging_face(
         keys[::2] == keys[1::2] and len(set(keys)) == IMAGES
     )  # questions about one image are known as such
     assert np.array_equal(decode(source.entries[5].picture, None), np.asarray(picture(2, 32)))
-    # Chosen questions travel to other processes, which read the images for themselves.
+    # Chosen questions are sent to other processes, which read the images themselves.
     asked = source.choose("probe", 4, 0)
     travelled = pickle.loads(pickle.dumps(asked))
     for one, other in zip(travelled.images[:], asked.images[:], strict=True):
@@ -317,7 +317,7 @@ def test_a_pipe_in_a_saved_data_set_is_refused_at_once(name: str, tmp_path: Path
 
 
 def test_a_saved_data_set_without_its_splits(tmp_path: Path) -> None:
-    """What lies beside it is another set."""
+    """What is beside it is another set."""
     datasets.Dataset.from_dict(hub_rows(3)).to_parquet(str(tmp_path / "train.parquet"))
     (tmp_path / "saved").mkdir()
     (tmp_path / "saved" / "dataset_dict.json").write_text('{"splits": ["train"]}')
@@ -385,7 +385,7 @@ def test_a_held_out_picture_under_another_name_among_those_to_learn_from_is_told
 def test_pictures_under_two_names_that_no_figure_relies_on_are_not_told(
     part: str, of: str, tmp_path: Path
 ) -> None:
-    """What is learned from is told of by the probe; one part may hold a picture twice."""
+    """The probe warns about data used for training; a part may hold a picture twice."""
     path, *_ = copied_across(tmp_path, part, of)
     heard: list[Event] = []
     sets.read(str(path)).choose(part, 1000, 0, on_event=heard.append)
@@ -504,12 +504,12 @@ def test_cotraining_for_a_gpu_has_its_next_questions_ready_and_they_are_the_same
     for waits in (False, True):
         monkeypatch.setattr(devices, "reading_stalls", lambda _, waits=waits: waits)
         loss_of = assemble._vqa_loss(model, settings, sets.read(str(lines)), lambda _: None)
-        # A run that goes on begins anywhere.
+        # A resumed run starts anywhere.
         places = [(step, Share(i, shares)) for step in (5, 6, 7, 0, 1) for i in range(shares)]
         each = [Pass(n, None, (), torch.empty(0), torch.empty(0), None, own) for n, own in places]
         found.append([loss_of(seen).item() for seen in each])
     assert found[0] == found[1] and len(set(found[0])) > 1
-    # Steps 5 to 8 and 0 to 2, the last of each run of steps for nobody; never by the training.
+    # Steps 5 to 8 and 0 to 2; the last of each sequence is not used. The training prepares none.
     deadline = time.monotonic() + 20
     while len(prepared) < 7 * shares and time.monotonic() < deadline:
         time.sleep(0.01)
@@ -520,7 +520,7 @@ def test_cotraining_for_a_gpu_has_its_next_questions_ready_and_they_are_the_same
 def test_a_picture_beside_a_data_set_that_changes_is_noticed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As of a file of lines; what holds its pictures itself changes with its own file."""
+    """As for a file of lines; a set that holds its pictures itself changes with its own file."""
     monkeypatch.setattr(datasets.config, "HF_DATASETS_CACHE", str(tmp_path / "cache"))
     picture(0).save(tmp_path / "0.png")
     stored = io.BytesIO()
@@ -537,7 +537,7 @@ def test_a_picture_beside_a_data_set_that_changes_is_noticed(
     picture(2, 41).save(tmp_path / "0.png")
     assert sets.read(str(tmp_path / "set.parquet")).state != before.state
     picture(0).save(tmp_path / "0.png")
-    (tmp_path / "gone.png").write_bytes(b"")  # nobody reads it
+    (tmp_path / "gone.png").write_bytes(b"")  # which is never read
     times = [e.picture.source.stat() for e in before.entries if isinstance(e.picture.source, Path)]
     assert len(times) == 1
 
@@ -547,7 +547,7 @@ def test_a_picture_beside_a_data_set_that_changes_is_noticed(
 
 def test_an_image_is_decoded_once_a_pass_and_not_before(lines: Path, decoded: list[str]) -> None:
     source = sets.read(str(lines))
-    for size in (3, 1, 1000):  # a batch's border may fall between an image's questions
+    for size in (3, 1, 1000):  # a batch may end between an image's questions
         decoded.clear()
         made = source.choose("probe", 1000, 0).sized(64)
         assert decoded == []
@@ -618,7 +618,7 @@ def test_colour_modes_and_orientation() -> None:
     )
     assert decode(stored(picture(1).convert("RGBA")), None).shape == (30, 40, 3)
     turned = Image.Exif()
-    turned[0x0112] = 6  # to be shown turned by 90 degrees clockwise
+    turned[0x0112] = 6  # to be shown rotated by 90 degrees clockwise
     upright = decode(stored(picture(1), exif=turned), None)
     assert np.array_equal(upright, np.rot90(np.asarray(picture(1)), -1))
 
@@ -631,7 +631,7 @@ def test_sizes_do_not_mix() -> None:
 
 
 def test_scenes_saved_as_files_are_answered_alike(tmp_path: Path) -> None:
-    """The shipped model through files: what it is shown is what was rendered."""
+    """The shipped model reads files: they show exactly what was rendered."""
     from aegis_cli.models import backbones
 
     model, scenes = backbones.load("embedded"), load_scenes("probe", 70)
@@ -698,4 +698,4 @@ def test_images_that_are_copied_without_their_times_are_the_same_and_changed_one
     changed[-1] ^= 1
     image.write_bytes(changed)
     os.utime(image, ns=(2**62, 2**62))
-    assert sets.read(str(path)).state != before  # though size and time are what they were
+    assert sets.read(str(path)).state != before  # though size and time are unchanged

@@ -1,4 +1,4 @@
-"""`aegis inspect QUESTIONS`: what a set holds, what is wrong with it, and what it looks like."""
+"""`aegis inspect QUESTIONS`: what a set holds, what is wrong with it, and how it looks."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def test_a_set_without_a_whole_image_is_refused(tmp_path: Path) -> None:
 
 def test_families_are_those_of_the_annotations(tmp_path: Path) -> None:
     path = write_official(tmp_path)
-    for named in (path, tmp_path):  # the file, or the folder with it
+    for named in (path, tmp_path):  # the file, or its folder
         found = summary.of_set(str(named))
         families = Counter({each.name: each.questions for each in found.families})
         assert families == {"number": 24, "other": 24}
@@ -104,7 +104,7 @@ def test_other_files_of_such_names_say_what_they_lack(tmp_path: Path, aegis) -> 
 
 
 def test_a_folder_that_is_something_else_is_no_set(tmp_path: Path, aegis) -> None:
-    """A run beside whose recipe somebody has put questions stays a run."""
+    """A run with a questions file beside its recipe stays a run."""
     write_official(tmp_path)
     (tmp_path / "recipe.yaml").write_text("kind: policy\n")
     assert "recipe.yaml" in refused(aegis("inspect", tmp_path))
