@@ -742,7 +742,7 @@ def asked_twice(rows: list[Any], **others: float) -> list[Any]:
     ("others", "says"),
     [
         ({"naive": 40, "kfac": 38}, "No method here kept VQA: naive lost 40.0 points"),
-        ({"naive": 40, "kfac": 2}, "kfac lost 2.0 points of VQA where naive lost 40.0, each of"),
+        ({"naive": 40, "kfac": 2}, "kfac lost 2.0 points of VQA where naive lost 40.0, each on"),
         ({"naive": 0, "kfac": 0}, "little to protect"),
     ],
 )
