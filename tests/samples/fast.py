@@ -1,4 +1,4 @@
-"""Which tests belong to `pytest -m fast`: about 1,200 that run in about a minute on two cores.
+"""Which tests belong to `pytest -m fast`: about 1,500 that run in about a minute on two cores.
 
 The rule: all rooms whose tests are pure computation, except the files that repeat it over many
 draws, and one or more files of every other room that neither train nor render. Files are listed as
