@@ -431,7 +431,7 @@ def moment(module: nn.Module, x: Tensor, keep: Tensor | None = None) -> tuple[Te
 
 
 def dense_rows(module: nn.Module, x: Tensor) -> Tensor:
-    """What a linear map or convolution multiplies [n, d], with a 1 where it has a bias.
+    """What a linear map or convolution multiplies [n, d], with a 1 appended if it has a bias.
 
     Rows narrower than float32 are widened.
     """

@@ -27,7 +27,7 @@ from aegis_cli.models.backbones.base import FLOAT32, STORED_TYPES, Backbone
 NAME = "aegis"
 _MARK = "<image>"  # marks the place of an image in a task's text
 _MOST = 1024  # tokens of an answer at most, unless a task says otherwise
-_BETWEEN_SHOTS = "\n\n"  # lmms-eval ends every answer at it; none of its own models does so
+_BETWEEN_SHOTS = "\n\n"  # lmms-eval's default end of an answer, which its own models ignore
 
 
 def manifest() -> ModelManifest:

@@ -348,7 +348,7 @@ class Earlier(NamedTuple):
     """Another training that a policy may have learned from, besides its own.
 
     Attributes:
-        said: what was trained on the episodes, and what that means.
+        said: for a warning: what was trained on the episodes, and what follows for the policy.
     """
 
     said: str

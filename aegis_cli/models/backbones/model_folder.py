@@ -176,10 +176,10 @@ def processor_class(folder: Path) -> str | None:
 
 
 def family(folder: Path, kind: str, layers: str | None) -> Family:
-    """The row of the table for a model of type `kind`, or a new one with the given layers.
+    """The row of the table for a model of type `kind`, with `layers` in place of its own, if given.
 
     Raises:
-        AegisError: an unknown type, and no layers given.
+        AegisError: an unknown type without layers.
     """
     if layers is None and (folder / _OWN).is_file():
         said = files.load_json(folder / _OWN)
