@@ -327,7 +327,7 @@ def _kept(
     missing = {each: name for each, name in named.items() if name not in own}
     layers = {number for each in named if (number := _layer(each)) is not None}
     there = {number for name in own if (number := _layer(key(name))) is not None}
-    # No gaps: up to the last layer that is present, even in part, nothing may be missing.
+    # No gaps: up to the last layer that is present, even in part, no weights may be missing.
     first = max(there, default=-1) + 1
     upper, after, buffers, middle = [], [], [], []
     for each, name in sorted(missing.items()):
