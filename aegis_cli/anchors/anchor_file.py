@@ -1,9 +1,9 @@
-"""An anchor as a file: what it holds as named tensors, and back.
+"""Save an anchor to a file as named tensors, and load it.
 
-Maps that share a spectrum store it once, under the first one's name; the header's `shared` gives
-that name for each of the others. Eigenvectors are in float32; those of a model that is too large
-for exact spectra of all its maps are in half precision, and are made orthonormal again when they
-are read. The rounding turns a direction by about 2e-4, so it lets through 4e-8 of its energy.
+Maps that share a spectrum store it once, under the first map's name; the header's `shared` maps
+each of the others to that name. Eigenvectors are in float32. If a model is too large for exact
+spectra of all its maps, they are in half precision and are made orthonormal again on loading. The
+rounding turns a direction by about 2e-4, so it lets through 4e-8 of its energy.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def save(
     Args:
         fingerprint: sha256 of the backbone's weights.
         meta: what else a reader has to know, such as the parts.
-        inputs: sha256 of what it was measured on, by a name for it.
+        inputs: name -> sha256 of the data it was measured on.
     """
     artifacts.save(
         path,
@@ -55,7 +55,7 @@ def save(
 
 
 def _followers(anchor: Anchor) -> dict[str, dict[str, str]]:
-    """The header's `shared`; nothing where no map shares."""
+    """The header's `shared`; empty if no map shares a spectrum."""
     followers: dict[str, str] = {}
     for part in _SPECTRA:
         for name, leader in shared(getattr(anchor, part)).items():
@@ -66,7 +66,7 @@ def _followers(anchor: Anchor) -> dict[str, dict[str, str]]:
 def _tensors(anchor: Anchor) -> dict[str, Tensor]:
     tensors: dict[str, Tensor] = {}
     if anchor.image:
-        # Every layer sees the same tokens, so that the first one's counts are those of all.
+        # Every layer sees the same tokens, so the first layer's counts hold for all.
         tensors["count"] = torch.tensor([anchor.image[0].count, anchor.text[0].count], device="cpu")
         for name, layers in zip(TYPES, (anchor.image, anchor.text), strict=True):
             for i, layer in enumerate(layers):
@@ -75,8 +75,8 @@ def _tensors(anchor: Anchor) -> dict[str, Tensor]:
     for part in _SPECTRA:
         spectra = getattr(anchor, part)
         followers = shared(spectra)
-        # One type for all of a part: half precision as soon as a map was too wide to be summed
-        # whole, as those of large models are.
+        # One dtype per part: half precision as soon as one map was too wide to be summed whole, as
+        # in large models.
         dtype = torch.float32 if all(s.whole for s in spectra.values()) else torch.float16
         for site, spectrum in spectra.items():
             if site not in followers:
@@ -85,7 +85,7 @@ def _tensors(anchor: Anchor) -> dict[str, Tensor]:
 
 
 def _spectrum_tensors(site: str, spectrum: Spectrum, dtype: torch.dtype) -> dict[str, Tensor]:
-    """Values and eigenvectors; these are most of the file.
+    """Eigenvalues and eigenvectors; the latter make up most of the file.
 
     Args:
         dtype: of the eigenvectors of a dense map.
@@ -97,7 +97,7 @@ def _spectrum_tensors(site: str, spectrum: Spectrum, dtype: torch.dtype) -> dict
         return {f"{site}.values": values, f"{site}.vectors": vectors.float()}
     found = {f"{site}.values": values, f"{site}.vectors": vectors.to(dtype)}
     if not spectrum.whole:
-        # The values without an eigenvector are all the same one, which is written once.
+        # The values without an eigenvector are all equal, so one of them is written.
         found[f"{site}.values"] = values[: vectors.shape[1]]
         found[f"{site}.rest"] = spectrum.rest.reshape(1)
     return found
@@ -107,7 +107,7 @@ def load(path: Path, fingerprint: str) -> Anchor:
     """Read the anchor of the backbone with this fingerprint.
 
     Raises:
-        AegisError: no anchor, a damaged one, or one of another backbone.
+        AegisError: no anchor, a damaged one, or that of another backbone.
     """
     return from_artifact(artifacts.load(path, "anchor", fingerprint=fingerprint))
 
@@ -143,7 +143,7 @@ def _spectra(
         if tensor.startswith(part) and tensor.endswith(".values"):  # every spectrum has values
             site = tensor.removesuffix(".values")
             found[site] = _spectrum(site, tensors)
-    # One object for all that share it, so that it is in memory once.
+    # All maps that share a spectrum get the same object, so it is in memory once.
     found |= {name: found[leader] for name, leader in followers.items() if leader in found}
     return {name.removeprefix(part): spectrum for name, spectrum in found.items()}
 
@@ -159,7 +159,7 @@ def _spectrum(site: str, tensors: artifacts.Tensors) -> Spectrum:
 
 
 def only(anchor: Anchor, parts: Collection[str]) -> Anchor:
-    """Keep of an anchor these parts alone, for the others may take gigabytes.
+    """Keep only these parts of an anchor, since the others may take gigabytes.
 
     Args:
         parts: some of `moments`, `inputs`, `curvature` and `fisher`; what the anchor lacks stays
@@ -184,7 +184,7 @@ def to_device(anchor: Anchor, device: torch.device) -> Anchor:
 
 
 def _moved(spectra: Mapping[str, Spectrum], device: torch.device) -> dict[str, Spectrum]:
-    moved: dict[int, Spectrum] = {}  # each once, by its id: maps that share one go on sharing it
+    moved: dict[int, Spectrum] = {}  # by id, so that maps go on sharing a spectrum
     for spectrum in spectra.values():
         if id(spectrum) not in moved:
             vectors = None if spectrum.vectors is None else spectrum.vectors.to(device)

@@ -34,8 +34,8 @@ class Measurement(Removable):
                     model(**batch)
         measured.save("anchor.safetensors")
 
-    Passes run without gradients, but for the curvature, which also asks for the answers' scores of
-    each pass:
+    Passes run without gradients, except for the curvature, which also needs the logits of each
+    pass's answers:
 
                 with measured.watch(batch["attention_mask"]):
                     scores = model(**batch).logits[:, :-1]
@@ -62,16 +62,16 @@ class Measurement(Removable):
             layers: as for `Guard`.
             part: as for `Guard`.
             parts: `moments` for `aegis`, `inputs` for `nullspace`, `curvature` for `kfac`, or
-                several; the curvature is that of maps which the answers' gradient reaches.
-            vision: dotted names of the parts that read pixels, among them the map from image to
-                text features; all they read counts, and padding of the text never reaches them.
+                several; the curvature covers the maps that the answers' gradient reaches.
+            vision: dotted names of the modules that read pixels, including the map from image to
+                text features; everything they read counts, since text padding never reaches them.
             energy: share of each map's input energy, or curvature, up to which eigenvectors are
                 kept.
-            seed: of the words that answers are drawn as.
+            seed: seed for drawing the words of the answers.
 
         Raises:
-            AegisError: unknown parts, layers that cannot be told, a model in training mode,
-                compiled or sharded.
+            AegisError: unknown parts, layers that cannot be identified, or a model that is in
+                training mode, compiled or sharded.
         """
         if not parts or set(parts) - set(PARTS):
             raise AegisError(
@@ -100,8 +100,8 @@ class Measurement(Removable):
             self._inputs = InputRecorder(model, structure.find_maps(model, pixels), pixels)
         if "curvature" in parts:
             self._curvature = CurvatureRecorder(model, structure.find_maps(model, ()), seed)
-        self._hooks = LayerHooks(self._layers)  # last, since what fails before would leave them
-        self._samples: int | None = 0  # None: a pass has not told how many it had
+        self._hooks = LayerHooks(self._layers)  # last: an error above would leave them
+        self._samples: int | None = 0  # None: the size of some pass is not known
         self._broken, self._unanswered = False, False
         self._removed = False
 
@@ -110,14 +110,14 @@ class Measurement(Removable):
         """Count the forward pass inside the block.
 
         Args:
-            mask: [B, T] of the tokens that the layers see, true at those that count; None: every
-                token counts.
-            image: [B, T] or [T], true at image tokens; needed for moments, and all false where
+            mask: [B, T] over the tokens that the layers see, true for tokens that count; None:
+                every token counts.
+            image: [B, T] or [T], true at image tokens; needed for moments, and all false if
                 prompts have no images.
 
         Raises:
             AegisError: a mask that does not fit, a map whose inputs cannot be told from padding, or
-                a measurement whose hooks were taken off.
+                a measurement whose hooks were removed.
         """
         if self._removed:
             raise AegisError(
@@ -142,7 +142,7 @@ class Measurement(Removable):
         failed_before, self._broken = self._broken, True  # unless the block ends well
         self._unanswered = self._curvature is not None
         with contextlib.ExitStack() as stack:
-            # Only the curvature goes back through the pass; a graph would take memory for nothing.
+            # Only the curvature needs a backward pass; otherwise a graph would waste memory.
             stack.enter_context(torch.set_grad_enabled(self._curvature is not None))
             if self._layers:
                 stack.enter_context(self._hooks.watch(mask, image, self._count))
@@ -151,10 +151,10 @@ class Measurement(Removable):
             if self._curvature is not None:
                 stack.enter_context(self._curvature.watch())
             yield
-        # With layers watched, `_count` knows the batch's size from what they return.
+        # If layers are watched, `_count` takes the batch size from their outputs.
         if not self._layers:
             self._add_samples(None if mask is None else len(mask))
-        # An earlier pass that failed half-way is still in the sums.
+        # The sums still contain an earlier pass that failed half-way.
         self._broken = failed_before
 
     def note(self, layer: int | nn.Module, hidden: Tensor) -> None:
@@ -162,17 +162,17 @@ class Measurement(Removable):
         self._hooks.note(layer, hidden)
 
     def answer(self, scores: Tensor) -> None:
-        """Go back from a watched pass's answers, for the curvature, once or several times per pass.
+        """Backpropagate from a watched pass's answers, for the curvature; may be called repeatedly.
 
         Words are drawn from the scores themselves, so which answers are right does not matter.
 
         Args:
-            scores: [..., V] unnormalised, with the pass's graph, at the positions where the words
-                of answers are predicted.
+            scores: [..., V] logits with the pass's graph, at the positions that predict the words
+                of answers.
 
         Raises:
-            AegisError: scores without a graph or without a position, or a measurement of other
-                parts.
+            AegisError: scores without a graph or without a position, or a measurement without
+                curvature.
         """
         if self._curvature is None:
             raise AegisError(
@@ -196,7 +196,7 @@ class Measurement(Removable):
         """Return what was measured so far.
 
         Raises:
-            AegisError: nothing, or a pass that failed half-way.
+            AegisError: nothing was measured, or a pass failed half-way.
         """
         self._check_answered()
         if self._broken:
@@ -210,7 +210,7 @@ class Measurement(Removable):
                 "run the questions first",
             )
         image, text = self._moments.image, self._moments.text
-        # The sums stay, so that more passes may follow and `anchor` may be asked again.
+        # The sums stay, so more passes may follow and `anchor` may be called again.
         inputs = {} if self._inputs is None else self._inputs.spectra(self._energy)
         curvature = {} if self._curvature is None else self._curvature.spectra(self._energy)
         return Anchor(image, text, inputs, curvature=curvature)
@@ -226,11 +226,11 @@ class Measurement(Removable):
         if self._layers:
             meta["layers"] = [plain(name) for name in self._layers]
         if wrappers.adapted(self._model):
-            # What maps read depends on adapters even where they change nothing.
+            # What maps read depends on adapters even if their weights are unchanged.
             meta["adapted"] = structure.fingerprint(self._model, adapters=True)
         recorders = [found for found in (self._inputs, self._curvature) if found is not None]
         if recorders:
-            # A guard says with it why a map that it should protect is not in the anchor.
+            # With this, a guard can say why a map that it should protect is not in the anchor.
             meta["unmeasured"] = {}
             for recorder in recorders:
                 meta["unmeasured"] |= {plain(n): why for n, why in recorder.unmeasured.items()}
@@ -239,7 +239,7 @@ class Measurement(Removable):
         )
 
     def remove(self) -> None:
-        """Take the hooks off; what was measured stays."""
+        """Remove the hooks; what was measured stays."""
         self._hooks.remove()
         self._removed = True
 

@@ -1,4 +1,4 @@
-"""The curvature of the answers' log-likelihood in each map's weights, as two Kronecker factors."""
+"""The curvature of the answers' log-likelihood in each map's weights: two Kronecker factors."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from aegis_cli.models import structure
 from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.models.wrappers import plain_names
 
-if TYPE_CHECKING:  # the guard comes here, and has no use for a renderer of scenes
+if TYPE_CHECKING:  # the guard imports this module and needs no scene renderer
     from aegis_cli.data.vqa.dataset import VQASet
 
 SIDES = ("inputs", "outputs")
@@ -42,8 +42,8 @@ class Weighed(SharedInput):
 
     Attributes:
         version: how often x had been changed in place when it was read.
-        arrived: how many of its readers a backward pass has come to.
-        weight: |g|, over the outputs of all that it has come to, [n, 1].
+        arrived: how many of its readers the backward pass has reached.
+        weight: |g| over the outputs of all readers that it has reached, [n, 1].
     """
 
     version: int = 0
@@ -53,11 +53,11 @@ class Weighed(SharedInput):
 
 @dataclass
 class AnswerEntropy:
-    """How sure a model is of the answers that a recorder has gone back from.
+    """How sure a model is of the answers that a recorder has backpropagated from.
 
     Attributes:
-        nats: entropy of its own distributions, summed over words.
-        words: how many.
+        nats: entropy of the model's own distributions, summed over words.
+        words: number of words.
     """
 
     nats: float = 0.0
@@ -81,8 +81,8 @@ class _Graph:
     """Where parameters enter the watched passes' graph: a backward pass need go no further.
 
     Attributes:
-        entries: at the outputs of modules.
-        lone: parameters that enter it otherwise, themselves.
+        entries: graph edges at the outputs of modules.
+        lone: the parameters that enter it in another way.
     """
 
     entries: list[GradientEdge] = field(default_factory=list)
@@ -90,9 +90,9 @@ class _Graph:
 
 
 def _refuse_changed(what: str, tensor: Tensor, version: int) -> None:
-    """Raise AegisError if a tensor is not what it was any more.
+    """Raise AegisError if a tensor has been changed in place since it was read.
 
-    Autograd does so itself where it needs the tensor, which it does not for a frozen map.
+    Autograd itself checks the tensors that it needs, but a frozen map's input is not one of them.
     """
     if tensor._version != version:
         raise AegisError(
@@ -107,16 +107,16 @@ class CurvatureRecorder:
 
     The factors are those of K-FAC (arXiv 1503.05671) with the partial traces of core/curvature.py
     in place of plain second moments: E[|g|^2 x x^T] [d, d] of inputs x, and E[|x|^2 g g^T] [o, o]
-    of gradients g at the outputs. No mask is needed: the gradient at a token that no answer reads
-    is 0.
+    of gradients g at the outputs. No mask is needed: the gradient at a token that no answer depends
+    on is 0.
 
     Linear maps that read the same tensor one after the other (queries, keys and values; gate and
-    up) have one input factor, with g over all their outputs, as if they were the one map that some
-    models have in their place.
+    up) share one input factor, with g over all their outputs, like the fused map that some models
+    have instead.
 
     Attributes:
-        unmeasured: maps that have been used in a way that no hook sees -> how.
-        entropy: of the answers so far.
+        unmeasured: maps that were used in a way that no hook sees -> how.
+        entropy: entropy of the answers so far.
     """
 
     def __init__(
@@ -132,8 +132,8 @@ class CurvatureRecorder:
         """Prepare; hooks are on the model only while a pass is watched.
 
         Args:
-            maps: those that are measured, as far as they are dense.
-            seed: of the words that answers are drawn as, where `answer` is not told otherwise.
+            maps: the maps, of which the dense ones are measured.
+            seed: seed for drawing the words of answers, unless `answer` is given numbers for it.
             follow_uses: as for `InputRecorder`.
             whole: as for `SecondMoments`.
             temperature: what the answers' scores are divided by.
@@ -142,7 +142,7 @@ class CurvatureRecorder:
         self._temperature, self.entropy = temperature, AnswerEntropy()
         self._sums = SecondMoments(whole)
         self._last: Weighed | None = None
-        self._open: list[Weighed] = []  # those that a backward pass has come to in part
+        self._open: list[Weighed] = []  # some of whose readers a backward pass has reached
         self._graph = _Graph()
         self._generator = torch.Generator().manual_seed(seed)
         self.unmeasured: dict[str, str] = {}
@@ -151,7 +151,7 @@ class CurvatureRecorder:
             for name, site in modules_of_sites(model, maps).items()
             if isinstance(model.get_submodule(name), DENSE)
         }
-        # Found before any pass is watched: to try a norm out is a use of its parameters too.
+        # Found before any pass is watched, since trying out a norm also uses its parameters.
         owning = structure.owning(model).items()
         self._called = {name for name, module in owning if structure.site_kind(module) is not None}
 
@@ -167,8 +167,8 @@ class CurvatureRecorder:
         self._graph.lone = []
         with contextlib.ExitStack() as hooks:
             for name, module in structure.owning(self._model).items():
-                # It is a map to be measured, or a module whose call shows where its parameters
-                # enter the graph, or one whose parameters others use: they are ends themselves.
+                # The module is a map to measure, or its call shows where its parameters enter the
+                # graph, or other modules use its parameters, which are then ends themselves.
                 site = self._sites.get(name)
                 if site is not None:
                     after = partial(self._follow_call, site)
@@ -184,22 +184,22 @@ class CurvatureRecorder:
             yield
 
     def answer(self, scores: Tensor, keep: bool = True, uniform: Tensor | None = None) -> None:
-        """Go back once through the graph of scores.
+        """Backpropagate once through the graph of scores.
 
         The gradient is that of log p(word) summed over the words, each drawn from the model's own
-        distribution: the Fisher information, not the empirical one, so that what the model is sure
-        of and right about counts as well. Where it is sure of nearly all, gradients vanish, and the
-        few questions that it is not sure of make up the sums; a temperature above 1 draws from a
-        flatter distribution, of which every question has gradients.
+        distribution. This gives the Fisher information, not the empirical one, so answers that the
+        model is sure of and right about count as well. If it is sure of nearly all answers,
+        gradients vanish and the few others make up the sums; a temperature above 1 draws from a
+        flatter distribution, for which every question has gradients.
 
         Args:
-            scores: [n, V] unnormalised, of the positions where answers' words are predicted.
+            scores: [n, V] logits at the positions that predict the words of answers.
             keep: keep the graph, for other scores of the same pass.
-            uniform: [n] float64 in [0, 1), by which the words are drawn; None draws them by the
+            uniform: [n] float64 in [0, 1) for drawing the words; None: they are drawn with the
                 recorder's seed, one call after the other.
 
         Raises:
-            AegisError: scores by which no word can be drawn.
+            AegisError: scores from which no word can be drawn.
         """
         self.entropy.add(scores)
         if uniform is None:
@@ -209,36 +209,36 @@ class CurvatureRecorder:
         self.follow(_log_likelihood(scores / self._temperature, uniform), keep)
 
     def follow(self, total: Tensor, keep: bool = True) -> None:
-        """Go back once through the graph of a sum over independent examples."""
-        # The gradients at the maps' outputs are all that counts. Asking for those at the entries
-        # leaves out the parameters' own, half of the work and as much memory as the model.
+        """Backpropagate once through the graph of a sum over independent examples."""
+        # Only the gradients at the maps' outputs are needed. Asking for those at the entries avoids
+        # the gradients of the parameters: half of the work, and as much memory as the model.
         ends = [*self._graph.entries, *self._graph.lone]
-        # What it returns is dropped: the hooks on the maps' outputs have seen all they need.
+        # The result is dropped: the hooks on the maps' outputs have seen all they need.
         # pyrefly: ignore[no-matching-overload]: torch takes both kinds of ends in one list
         torch.autograd.grad(total, ends, retain_graph=keep, allow_unused=True)
-        for reading in self._open:  # an answer may not depend on all that read the same
+        for reading in self._open:  # answers may not depend on all readers
             self._count_inputs(reading)
         self._open = []
         if not keep:
             self.forget()
 
     def forget(self) -> None:
-        """Let go of the watched passes' graph."""
+        """Release the watched passes' graph."""
         self._last, self._open, self._graph.entries = None, [], []
 
     def kept(self) -> Kept:
-        """The sums so far, to be kept while no graph waits for a backward pass."""
+        """The sums so far, for saving; no graph may be waiting for a backward pass."""
         sums = self._sums.kept()
         entropy = [self.entropy.nats, self.entropy.words]
         return Kept({**sums.figures, "entropy": entropy}, sums.tensors)
 
     def restore(self, kept: Kept, device: torch.device) -> None:
-        """Go on from what was kept, before the first pass, where `measure` draws the words."""
+        """Continue from saved sums, before the first pass; `measure` draws the words itself."""
         self._sums.restore(kept, device)
         self.entropy.nats, self.entropy.words = kept.figures["entropy"]
 
     def add_up(self, ranks: Ranks) -> None:
-        """Count what all processes have gone back through, each in passes of its own."""
+        """Add the sums of all processes, each of which had its own passes."""
         self._sums.add_up(ranks)
 
     def check_complete(self) -> None:
@@ -256,8 +256,8 @@ class CurvatureRecorder:
 
         Args:
             energy: share of each factor's trace up to which eigenvectors are kept.
-            release: forget the sums on the way.
-            stage: what the progress is called.
+            release: release each sum once it is no longer needed.
+            stage: name of the stage in progress events.
 
         Raises:
             AegisError: no map took part.
@@ -281,11 +281,11 @@ class CurvatureRecorder:
         named: Mapping[str, Any],
         output: Any,
     ) -> None:
-        """Note the output of a module whose parameters are all that asks for a gradient."""
+        """Note the output of a module if only its parameters require a gradient."""
         read = [t for t in (*arguments, *named.values()) if isinstance(t, Tensor)]
         enters = not any(t.requires_grad for t in read)
         if enters and isinstance(output, Tensor) and output.requires_grad:
-            # The edge is taken now: the tensor's own would move where the model goes on in place.
+            # The edge is taken now, since the tensor's own changes with an in-place operation.
             self._graph.entries.append(get_gradient_edge(output))
 
     def _follow_call(
@@ -309,11 +309,11 @@ class CurvatureRecorder:
 
     @torch.no_grad()
     def _count(self, reading: Weighed, site: str, module: nn.Module, gradient: Tensor) -> None:
-        """Add what one call of the module says by the gradient at its output."""
+        """Add what one call of the module contributes, given the gradient at its output."""
         _refuse_changed(f"what '{site}' read", reading.x, reading.version)
         x = inputs.dense_rows(module, reading.x)  # [n, d], with a 1 at the end for a bias
         g = widened(_output_rows(module, gradient))  # [n, o]
-        # |x|^2 g g^T is the second moment of the row |x| g, and so for the other factor.
+        # |x|^2 g g^T is the second moment of the row |x| g; likewise for the other factor.
         self._sums.note(f"{site}.{SIDES[0]}")
         self._sums.add_rows([f"{site}.{SIDES[1]}"], g * x.norm(dim=1, keepdim=True))
         size = g.norm(dim=1, keepdim=True)
@@ -327,7 +327,7 @@ class CurvatureRecorder:
             self._open = [other for other in self._open if other is not reading]
 
     def _count_inputs(self, reading: Weighed) -> None:
-        """Add |g|^2 x x^T of what was read, when a backward pass has come to all its readers."""
+        """Add |g|^2 x x^T of what was read, over the readers that a backward pass has reached."""
         assert reading.weight is not None
         rows = inputs.dense_rows(reading.module, reading.x.detach()) * reading.weight  # |g| x
         names = [f"{site}.{SIDES[0]}" for site in reading.sites]
@@ -359,22 +359,22 @@ def measure(
     entropy: AnswerEntropy | None = None,
     work: kept_work.Work = kept_work.NOTHING,
 ) -> dict[str, Spectrum]:
-    """Both factors, `site.inputs` and `site.outputs`, of each dense map of one of our backbones.
+    """Measure both factors, `site.inputs` and `site.outputs`, of each dense map of a backbone.
 
-    Each question's words are drawn by the seed and by its number in the set. So neither the batch
-    size nor the number of groups or processes shows.
+    Each question's words are drawn from the seed and its number in the set, so the result depends
+    neither on the batch size nor on the number of groups or processes.
 
     Args:
-        seed: of the words that answers are drawn as.
+        seed: seed for drawing the words of answers.
         memory: as for `inputs.measure`.
         whole: as for `SecondMoments`.
         ranks: the processes that share the passes.
         temperature: what the answers' scores are divided by before words are drawn from them.
-        entropy: what is to count the answers of this process.
+        entropy: counts the answers of this process.
         work: as for `inputs.measure`.
 
     Raises:
-        AegisError: modules that no inputs describe, or that these questions do not use.
+        AegisError: modules that inputs cannot describe, or that these questions do not use.
     """
     found: dict[str, Spectrum] = {}
     entropy = entropy or AnswerEntropy()
@@ -398,17 +398,17 @@ def measure(
             done = begun.figures["done"]
         with recorder.watch(), torch.enable_grad(), piece.going(recorder.kept) as passed:
             for part in passes.run(model, asked, batch_size, stage, on_event, ranks, done, passed):
-                # Questions of one image may share its graph: their drawn words are independent, so
-                # what their gradients have in common is 0 on average.
+                # Questions about one image may share its graph: their words are drawn
+                # independently, so the cross terms of their gradients are 0 on average.
                 uniform = _uniform(seed, part.question)
                 recorder.answer(part.scores, keep=False, uniform=uniform)
         recorder.add_up(ranks)
         recorder.check_complete()
         spectra = recorder.spectra(energy, True, f"{stage} spectra", on_event)
-        # They come in the backward pass's order.
+        # The recorder returns them in the order of the backward pass.
         spectra = {name: spectra[name] for name in recorder.names}
         kept = second_moments.to_keep(spectra)
-        # Of every process, whose sum is that of all groups up to here.
+        # Of every process, each of which has summed over all groups so far.
         entropies = ranks.gathered((entropy.nats, entropy.words))
         piece.finish(Kept({**kept.figures, "entropies": entropies}, kept.tensors))
         found |= spectra
@@ -418,11 +418,11 @@ def measure(
 def warn_of_sure_answers(
     entropy: float, temperature: float, stage: str, effect: str, on_event: OnEvent
 ) -> None:
-    """Warn of a curvature that hangs on the few questions of which the backbone is not sure.
+    """Warn of a curvature that depends on the few answers that the backbone is not sure of.
 
     Args:
-        entropy: of the backbone's own answers, in nats a word.
-        effect: what it does, and what helps.
+        entropy: entropy of the backbone's own answers, in nats per word.
+        effect: what follows from it, and what helps.
     """
     if entropy < _SURE and temperature == 1:
         text = (
@@ -455,10 +455,10 @@ def _output_rows(module: nn.Module, gradient: Tensor) -> Tensor:
 
 
 def _uniform(seed: int, question: Tensor) -> Tensor:
-    """A number in [0, 1) for each word of some questions' answers, [n] float64.
+    """A number in [0, 1) for each word of the answers to some questions, [n] float64.
 
     Args:
-        question: [n], the number of the question that each word answers.
+        question: [n], the number of the question to which each word belongs.
     """
     own, words = question.unique_consecutive(return_counts=True)  # a question's words are together
     found = []
@@ -470,8 +470,8 @@ def _uniform(seed: int, question: Tensor) -> Tensor:
 def _log_likelihood(scores: Tensor, uniform: Tensor) -> Tensor:
     """The log-likelihood of words drawn from the scores [n, V] themselves.
 
-    A word is the first one up to which the chances sum to more than its number in [0, 1). Sums move
-    little by rounding, so that batches of another size have the same words.
+    The drawn word is the first one at which the cumulative probability exceeds its number in
+    [0, 1). Rounding changes the sums little, so batches of another size have the same words.
 
     Args:
         uniform: [n] float64 in [0, 1), on the CPU.
@@ -485,8 +485,8 @@ def _log_likelihood(scores: Tensor, uniform: Tensor) -> Tensor:
             f"{FINITE}, and see that its weights are finite",
         )
     below = chances.double().cumsum(-1)  # [n, V]
-    # Divided by the last sum, which rounding may leave below 1, so that a word is found for every
-    # number. `right`, so that a word of chance 0 is never drawn, not even by the number 0.
+    # Divided by the last sum, which rounding may leave below 1, so that every number finds a word.
+    # `right`, so that a word of probability 0 is never drawn, not even by the number 0.
     drawn = torch.searchsorted(below / below[:, -1:], uniform[:, None], right=True)  # [n, 1]
     drawn = drawn.to(scores.device)
     return scores.float().log_softmax(-1).gather(1, drawn).sum()

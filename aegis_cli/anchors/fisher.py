@@ -1,4 +1,4 @@
-"""The diagonal Fisher information of a VLM's answers, as EWC (arXiv 1612.00796) weighs by it."""
+"""The diagonal Fisher information of a VLM's answers, the weights of EWC (arXiv 1612.00796)."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ def measure(
 ) -> dict[str, Tensor]:
     """Measure E[(d log p(answer | image, question) / d theta)^2] of each parameter.
 
-    This is the empirical Fisher information, that of the right answers. Each question has a
-    backward pass of its own: squares of a batch's mean gradient would not be the mean of squares.
+    This is the empirical Fisher information, that of the reference answers. Each question has a
+    backward pass of its own: the square of a batch's mean gradient is not the mean of squares.
 
     Args:
-        samples: questions, spread evenly over the set.
-        ranks: the processes that take turns in going back from one.
-        work: what is kept of an interrupted measurement, and of this one.
+        samples: number of questions, spread evenly over the set.
+        ranks: the processes, which take questions in turn.
+        work: the saved state of an interrupted measurement, and of this one.
 
     Returns:
-        A tensor like each parameter, by its name, float32.
+        Parameter name -> tensor of the parameter's shape, float32.
     """
     piece = work.piece(_STAGE)
     if (known := piece.finished()) is not None:
@@ -56,7 +56,7 @@ def measure(
             if (done - 1) % ranks.count == ranks.rank:  # the processes take turns
                 likelihood = _log_likelihood(model, asked, row)
                 wanted = list(parameters.values())
-                # Not by `backward`, which would leave a gradient in every parameter.
+                # Not `backward`, which would leave a gradient in every parameter.
                 gradients = torch.autograd.grad(likelihood, wanted, allow_unused=True)
                 for name, gradient in zip(parameters, gradients, strict=True):
                     if gradient is not None:

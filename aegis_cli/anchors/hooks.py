@@ -24,11 +24,11 @@ Report = Callable[[Callable[..., Any], nn.Parameter, Sequence[str], tuple[Any, .
 
 
 class Removable(ABC):
-    """An owner of hooks: as a context manager, it takes them off when the block ends."""
+    """An owner of hooks; as a context manager, it removes them when the block ends."""
 
     @abstractmethod
     def remove(self) -> None:
-        """Take the hooks off."""
+        """Remove the hooks."""
 
     def __enter__(self) -> Self:
         return self
@@ -46,10 +46,9 @@ class Removable(ABC):
 
 
 class LayerHooks:
-    """Hooks on the layers that keep what they return, while a block is open.
+    """Hooks that keep what the layers return while a block is open.
 
-    It refers to the model by its hooks alone, so that copying the model does not copy their
-    owner.
+    Only the hooks connect it to the model, so that copying the model does not copy this object.
     """
 
     def __init__(self, layers: Mapping[str, nn.Module]) -> None:
@@ -84,13 +83,13 @@ class LayerHooks:
         """Hand what the layers return inside the block to `done`, unless it ends by an exception.
 
         Args:
-            mask: [B, T] of all tokens that a layer sees in the block, in the order of its calls;
+            mask: [B, T] over all tokens that a layer sees in the block, in the order of its calls;
                 None: all count.
-            image: [T] or [B, T], true at image tokens; None: no token is one.
+            image: [T] or [B, T], true at image tokens; None: there are none.
 
         Raises:
-            AegisError: a block inside another, layers that were not called or do not fit together,
-                or masks of other tokens.
+            AegisError: a block inside another, layers that were not called or whose outputs do not
+                fit together, or masks that do not fit the tokens.
         """
         if self.open:
             raise AegisError(
@@ -98,7 +97,7 @@ class LayerHooks:
                 "one at a time",
                 "close the first before the second",
             )
-        # `_graph`: whether hidden states are to have one, which a layer may fail to give them.
+        # `_graph`: whether hidden states should have a graph, which a layer may fail to give them.
         self._calls, self._graph = [[] for _ in self._names], torch.is_grad_enabled()
         self._noted = set()
         try:
@@ -109,20 +108,21 @@ class LayerHooks:
             ]
         finally:
             self._calls = None
-        # Only now, when the next block can open, whatever `done` raises.
+        # Only now that the next block can open, whatever `done` raises.
         done(_pass(hidden, mask, image))
 
     def note(self, layer: int | nn.Module, hidden: Tensor) -> None:
-        """Take what a layer would have returned from a loop that calls the layer's parts itself.
+        """Take a layer's output from a loop that calls the layer's submodules itself.
 
-        Outside a watched block it does nothing, as a layer's hook does nothing there.
+        Outside a watched block this does nothing, like a layer's hook.
 
         Args:
             layer: one of the layers, or its number.
-            hidden: [B, T, D], of the tokens that the mask is of.
+            hidden: [B, T, D], for the tokens of the mask.
 
         Raises:
-            AegisError: none of the layers, no hidden states, or a layer that returns them itself.
+            AegisError: not one of the layers, no hidden states, or a layer whose own output was
+                already seen.
         """
         if self._calls is None:
             return
@@ -175,7 +175,7 @@ class LayerHooks:
                 'gradient_checkpointing_kwargs={"use_reentrant": False}; in the place of '
                 "torch.no_grad(), layer.requires_grad_(False) before the guard is made",
             )
-        # [B, ..., D] -> [B, T, D], also of a layer that returns [B, H, W, D].
+        # [B, ..., D] -> [B, T, D], also for a layer that returns [B, H, W, D].
         self._calls[index].append(first.flatten(1, -2))
 
     def _joined(self, name: str, calls: list[Tensor]) -> Tensor:
@@ -194,16 +194,16 @@ class LayerHooks:
                 "one batch per watched block",
                 "watch one forward pass at a time",
             )
-        # A layer may be called for some of the tokens at a time, as for a cached prefix first.
+        # A layer may be called for some of the tokens at a time, for example a cached prefix first.
         return calls[0] if len(calls) == 1 else torch.cat(calls, dim=1)
 
 
 def _forget_compiled() -> None:
-    """Have all that torch.compile has compiled compiled anew, since it sees no later hooks.
+    """Discard what torch.compile has compiled, since that code misses hooks added later.
 
     Code that was compiled for another model of the same class is used for this one, too.
     """
-    # Where it is not loaded, nothing is compiled, and it loads slowly.
+    # If dynamo is not loaded, nothing is compiled; it loads slowly.
     if (dynamo := sys.modules.get("torch._dynamo")) is not None:
         dynamo.reset()
 
@@ -231,10 +231,10 @@ def _pass(hidden: list[Tensor], mask: Tensor | None, image: Tensor | None) -> Pa
 
 
 def _valid(mask: Tensor | None, shape: torch.Size, device: torch.device) -> Tensor:
-    """Which of the layers' tokens count, [B, T] bool; one at least.
+    """Which of the layers' tokens count, [B, T] bool; at least one.
 
     Raises:
-        AegisError: a mask of other tokens, or of none.
+        AegisError: a mask that does not fit the tokens, or by which none counts.
     """
     if mask is None:
         valid = torch.ones(shape, dtype=torch.bool, device=device)
@@ -300,8 +300,8 @@ class SharedInput:
 
     def serves(self, site: str, module: nn.Module, x: Tensor) -> bool:
         """Whether this is also what a module reads that has been called with x."""
-        # The same object: equal values in another tensor may be changed by themselves later. With a
-        # bias the rows end with a 1, so that readers with and without one have other rows.
+        # The same object, since another tensor with equal values may be changed independently. With
+        # a bias the rows end with a 1, so readers with and without a bias have different rows.
         return (
             x is self.x
             and not self.of_convolution
@@ -315,9 +315,9 @@ class SharedInput:
 
 
 def modules_of_sites(model: nn.Module, maps: structure.Maps) -> dict[str, str]:
-    """The module names whose parameters are a measured site's, each with that site.
+    """Names of the modules whose parameters belong to a measured site -> that site.
 
-    A site is the module itself, or the one whose parameters it shares.
+    The site is the module itself, or the module whose parameters it shares.
     """
     sites = {name: maps.twins.get(name, name) for name in structure.owning(model)}
     return {name: site for name, site in sites.items() if site in maps.kinds}
@@ -327,7 +327,7 @@ def modules_of_sites(model: nn.Module, maps: structure.Maps) -> dict[str, str]:
 def watch_uses(model: nn.Module, report: Report) -> Generator[None]:
     """Report each use of a parameter inside the block while its module's forward is not running.
 
-    No hook on a module sees such a use. It is a function that is given the parameter and returns
+    No hook on a module sees such a use: a call of a function that takes the parameter and returns
     tensors.
     """
     owners = structure.owners(model)
@@ -358,7 +358,7 @@ def _end(inside: list[str], *_: Any) -> None:
 
 
 def describe_use(function: Callable[..., Any]) -> str:
-    """What the file of an anchor says of a parameter's use by this function."""
+    """How an anchor's file describes the use of a parameter by this function."""
     return f"{getattr(function, '__name__', function)} reads its parameters outside its forward"
 
 

@@ -1,4 +1,4 @@
-"""Second moments of what every map of a model reads while it answers questions."""
+"""Second moments of the inputs of every map of a model while it answers questions."""
 
 from __future__ import annotations
 
@@ -28,20 +28,20 @@ from aegis_cli.models import structure
 from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.models.wrappers import plain_names
 
-if TYPE_CHECKING:  # the guard comes here, and has no use for a renderer of scenes
+if TYPE_CHECKING:  # the guard imports this module and needs no scene renderer
     from aegis_cli.data.vqa.dataset import VQASet
 
 _LARGE = 10**8  # bytes of sums
-_DRAWS = "draws"  # where the state of the generator is kept
+_DRAWS = "draws"  # the key of the generator's state
 
 
 @dataclass
 class Reading(SharedInput):
-    """What a dense map has just read, until another tensor is read: others may read it as well.
+    """What a dense map has just read, until another tensor is read: other maps may read it too.
 
     Attributes:
         keep: which of its rows count, [rows] bool; None: all.
-        rows: a copy of what counts, [n, d].
+        rows: a copy of the rows that count, [n, d].
     """
 
     keep: Tensor | None
@@ -50,24 +50,24 @@ class Reading(SharedInput):
 
 @dataclass(frozen=True)
 class Drawn:
-    """Which rows count: a share of each call's, drawn without replacement.
+    """Which rows count: a share of the rows of each call, drawn without replacement.
 
-    The share is rounded to whole rows of each call, so that short calls may count a little more or
-    less than long ones; among some hundred rows that is nothing.
+    The share is rounded to whole rows per call, so short calls may count a little more or less than
+    long ones; with some hundred rows this is negligible.
 
     Attributes:
-        share: above 0, up to 1, which draws nothing.
-        seed: of the draws.
+        share: in (0, 1]; 1: all rows count and nothing is drawn.
+        seed: seed of the draws.
     """
 
     share: float = 1.0
     seed: int = 0
 
     def of_process(self, rank: int) -> Drawn:
-        """What the process of this number draws: the first as it would alone, others otherwise."""
+        """The draws of the process of this rank; rank 0 draws as a single process does."""
         if rank == 0:
             return self
-        # A generator on the CPU takes 32 bits of its seed, so that the number has to be mixed in.
+        # A generator on the CPU uses 32 bits of its seed, so the rank has to be mixed in.
         mixed = np.random.SeedSequence([self.seed, rank]).generate_state(1)
         return replace(self, seed=int(mixed[0]))
 
@@ -75,7 +75,7 @@ class Drawn:
         return torch.Generator().manual_seed(self.seed)
 
     def of(self, rows: Tensor, generator: torch.Generator) -> Tensor:
-        """A copy of those of the rows [n, d] that count, one at least; all as they are."""
+        """A copy of the rows of [n, d] that count, at least one; if all count, no copy is made."""
         if self.share == 1:
             return rows
         count = max(1, round(self.share * len(rows)))
@@ -89,17 +89,17 @@ ALL = Drawn()
 class InputRecorder:
     """Sums the second moments of what every map reads in watched passes, padding left out.
 
-    A second moment is E[x x^T] [d, d] of the rows x that a map multiplies, with a 1 appended where
-    it has a bias (GPM, arXiv 2103.09762; core/spectrum.py). Linear maps that read the same tensor
+    A second moment is E[x x^T] [d, d] of the rows x that a map multiplies, with a 1 appended if the
+    map has a bias (GPM, arXiv 2103.09762; core/spectrum.py). Linear maps that read the same tensor
     one after the other (queries, keys and values; gate and up) share one.
 
     Outside `vision`, a map's rows are those of the mask: its calls in one pass cover the T tokens
-    in their order, once or several times. A map that does otherwise is refused where the mask
-    leaves something out. For a table it only counts which rows are read; one that reads something
-    else than the tokens (positions) counts whole, which protects more, never less.
+    in order, once or several times. If the mask leaves tokens out, any other map is refused. For a
+    table, only which rows are read matters; if it reads something other than the tokens (such as
+    positions), all of it counts, which protects more, never less.
 
     Attributes:
-        unmeasured: maps and tables that have been read in a way that no hook sees -> how.
+        unmeasured: maps and tables that were read in a way that no hook sees -> how.
     """
 
     def __init__(
@@ -115,10 +115,10 @@ class InputRecorder:
         """Prepare; hooks are on the model only while a pass is watched.
 
         Args:
-            maps: what is measured.
-            vision: dotted names of the parts that read pixels, which no mask concerns.
+            maps: the maps to measure.
+            vision: dotted names of the modules that read pixels, to which no mask applies.
             follow_uses: also look for parameters that are used outside their module's forward. A
-                backbone that names its tied heads itself needs no such search.
+                backbone that names its tied heads itself does not need this search.
             whole: as for `SecondMoments`.
             drawn: which rows of linear maps, convolutions and tied heads count.
         """
@@ -143,14 +143,14 @@ class InputRecorder:
         Args:
             mask: [B, T] bool, true at the tokens that count; None: all do.
         """
-        # Where all tokens count, no map's rows have to be told apart, whatever their shape.
+        # If all tokens count, no map's rows have to be told apart, whatever their shape.
         self._mask = None if mask is None or mask.all() else mask
         self._covered, self._ids, self._reading = {}, {}, None
         with contextlib.ExitStack() as hooks:
             if self._follow_uses:
                 hooks.enter_context(watch_uses(self._model, self._count_use))
             for name, site in modules_of_sites(self._model, self._maps).items():
-                # Before the call: a module may change in place what it was given.
+                # Before the call, since a module may change its input in place.
                 before = partial(self._count_call, name, site)
                 module = self._model.get_submodule(name)
                 hooks.callback(module.register_forward_pre_hook(before, with_kwargs=True).remove)
@@ -165,18 +165,18 @@ class InputRecorder:
             self._count_table(site, read)
 
     def kept(self) -> Kept:
-        """The sums so far and the place in the draws, to be kept between two passes."""
-        self._count_reading()  # what was read last waits for others that may read it, too
+        """The sums so far and the state of the draws, for saving between two passes."""
+        self._count_reading()  # the last tensor read is still waiting for other readers
         sums = self._sums.kept()
         return Kept(sums.figures, {**sums.tensors, _DRAWS: self._generator.get_state()})
 
     def restore(self, kept: Kept, device: torch.device) -> None:
-        """Go on from what was kept, before the first pass."""
+        """Continue from saved sums, before the first pass."""
         self._sums.restore(kept, device)
         self._generator.set_state(kept.tensors[_DRAWS])
 
     def add_up(self, ranks: Ranks) -> None:
-        """Count what all processes have read, each in passes of its own."""
+        """Add the sums of all processes, each of which had its own passes."""
         self._sums.add_up(ranks)
 
     def check_complete(self) -> None:
@@ -196,8 +196,8 @@ class InputRecorder:
 
         Args:
             energy: share of each map's input energy up to which eigenvectors are kept.
-            release: forget the sums on the way.
-            stage: what the progress is called.
+            release: release each sum once it is no longer needed.
+            stage: name of the stage in progress events.
 
         Raises:
             AegisError: no map read anything.
@@ -224,7 +224,7 @@ class InputRecorder:
     ) -> None:
         x = _first(arguments, named)
         if isinstance(module, nn.Embedding) and self._mask is not None:
-            # Which tokens a table reads is known when all its calls have come.
+            # Which tokens a table reads is known only after all of its calls.
             self._ids.setdefault(site, []).append(x)
         elif isinstance(module, nn.Embedding):
             self._sums.add(site, *moment(module, x))
@@ -242,7 +242,7 @@ class InputRecorder:
         named: Mapping[str, Any],
         output: Tensor,
     ) -> None:
-        """Count what a tied head scores: a linear map's input, any other module's output."""
+        """Count a tied head's input: that of a linear map, or the output of any other module."""
         scored = _first(arguments, named) if isinstance(module, nn.Linear) else output
         self._count_scores(table, name, scored)
 
@@ -255,7 +255,7 @@ class InputRecorder:
     ) -> None:
         """Count a tied head; note any other use of a parameter outside its module's forward.
 
-        A lone row is held still, whoever reads it.
+        A lone row is frozen, so its uses do not matter.
         """
         if any(row is parameter for row in self._lone.values()):
             return
@@ -275,7 +275,7 @@ class InputRecorder:
     # --- rows -------------------------------------------------------------------------------------
 
     def _count_scores(self, table: str, name: str, x: Tensor) -> None:
-        """Count what a tied head scores against the table's rows."""
+        """Count what a tied head multiplies by the table's rows."""
         keep, rows = self._rows(name, x), x.flatten(0, -2)
         rows = rows if keep is None else rows[keep]
         self._sums.add_rows([f"{table}.scores"], self._drawn.of(rows, self._generator))
@@ -291,29 +291,28 @@ class InputRecorder:
         rows = dense_rows(module, x)
         rows = self._drawn.of(rows if keep is None else rows[keep], self._generator)
         if rows.data_ptr() == x.data_ptr():
-            rows = rows.clone()  # the model may go on in place
+            rows = rows.clone()  # the model may change them in place
         self._reading = Reading(x, module, [site], keep, rows)
 
     def _count_reading(self) -> None:
-        """Add what was read last, now that all its readers have come."""
+        """Add what was read last, once all of its readers are known."""
         if self._reading is not None:
             done, self._reading = self._reading, None
             self._sums.add_rows(done.sites, done.rows, done.of_convolution)
 
     def _rows(self, name: str, x: Tensor) -> Tensor | None:
-        """Which of a map's rows are tokens that count; None: all.
+        """Which of a map's rows are tokens that count, [rows] bool; None: all.
 
-        They are those of the mask from where the map's calls in this pass have arrived: [rows]
-        bool.
+        The mask is read from the token that the map's earlier calls in this pass have reached.
         """
         if self._mask is None or structure.under(self._plain(name), self._vision):
             return None
         batch, length = self._mask.shape
-        if x.ndim > 3 and x.shape[:2] == self._mask.shape:  # several rows a token, as of heads
+        if x.ndim > 3 and x.shape[:2] == self._mask.shape:  # several rows per token, such as heads
             self._covered[name] = self._covered.get(name, 0) + length
             per_token = x.shape[2:-1].numel()  # of [B, T, ..., d]
             return self._mask.flatten().repeat_interleave(per_token).to(x.device)
-        # A map that is called again after all T tokens begins with the first of them again.
+        # A map that is called again after all T tokens starts over with the first one.
         begun, rows = self._covered.get(name, 0) % length, x.shape[:-1].numel()
         tokens = rows // batch  # of each text; x is [B, tokens, d], or flat, [B * tokens, d]
         if rows % batch or x.shape[0] not in (batch, rows) or begun + tokens > length:
@@ -331,7 +330,7 @@ class InputRecorder:
             whole = torch.cat([ids.flatten(1) for ids in read], dim=1)  # [B, tokens]
             if whole.shape == self._mask.shape:
                 read = [whole[self._mask.to(whole.device)]]
-        # If the calls do not make up the tokens of the mask, all that was read counts.
+        # If the calls do not cover exactly the tokens of the mask, everything read counts.
         for ids in read:
             self._sums.add(site, *moment(self._modules[site], ids))
 
@@ -359,16 +358,16 @@ def measure(
         whole: as for `SecondMoments`.
         ranks: the processes that share the passes.
         drawn: as for `InputRecorder`; each process draws by itself.
-        work: what is kept of an interrupted measurement, and of this one.
+        work: the saved state of an interrupted measurement, and of this one.
 
     Raises:
-        AegisError: modules that no inputs describe, or that these questions do not use.
+        AegisError: modules that inputs cannot describe, or that these questions do not use.
     """
     found: dict[str, Spectrum] = {}
     sized = partial(_size, whole)
     with contextlib.ExitStack() as until_measured:
         if sum(sized(module) for module in model.site_modules().values()) > _LARGE:
-            # Sums lie between what the passes take and free, of which much would be kept.
+            # Sums lie between blocks that the passes free, so much freed memory would be kept.
             until_measured.enter_context(memory_of_process.returned())
         for maps, stage in passes.groups(model, "anchor inputs", memory, sized):
             piece = work.piece(stage)
@@ -400,7 +399,7 @@ def _size(whole: int, module: nn.Module) -> int:
 
 
 def kept_share(inputs: Mapping[str, Spectrum]) -> float | None:
-    """Share of all maps' input directions whose eigenvectors are stored; None without such a map.
+    """Share of all maps' input directions whose eigenvectors are stored; None if no map has any.
 
     A table needs no eigenvectors and stores none.
     """
@@ -409,18 +408,18 @@ def kept_share(inputs: Mapping[str, Spectrum]) -> float | None:
         if spectrum.vectors is None:
             continue
         directions += spectrum.values.numel()
-        # A normalisation keeps all its directions, which are two per channel at most.
+        # A normalisation keeps all its directions, at most two per channel.
         whole = spectrum.vectors.ndim == 3
         kept += spectrum.values.numel() if whole else spectrum.vectors.shape[1]
     return kept / directions if directions else None
 
 
 def moment(module: nn.Module, x: Tensor, keep: Tensor | None = None) -> tuple[Tensor, int]:
-    """Summed second moment of what a normalisation's or table's parameters multiply, and its rows.
+    """Summed second moment of what a normalisation's or table's parameters multiply, and row count.
 
     Args:
-        x: its input: [..., d] of a normalisation, ids of a table.
-        keep: [rows] bool; which rows (of a table: look-ups), one per output token, count; None:
+        x: its input: [..., d] for a normalisation, ids for a table.
+        keep: [rows] bool: which rows count (for a table: look-ups), one per output token; None:
             all.
     """
     if isinstance(module, nn.Embedding):
@@ -432,7 +431,7 @@ def moment(module: nn.Module, x: Tensor, keep: Tensor | None = None) -> tuple[Te
 
 
 def dense_rows(module: nn.Module, x: Tensor) -> Tensor:
-    """What a linear map or convolution multiplies [n, d], with a 1 where it has a bias.
+    """What a linear map or convolution multiplies [n, d], with a 1 appended if it has a bias.
 
     Rows narrower than float32 are widened.
     """
@@ -444,10 +443,10 @@ def dense_rows(module: nn.Module, x: Tensor) -> Tensor:
 
 
 def dense_width(module: nn.Module) -> int | None:
-    """The width d of these rows; None for a module that is neither of both."""
+    """The width d of these rows; None for any other module."""
     if not isinstance(module, DENSE):
         return None
-    # A weight is [o, d], or a convolution's [o, c, k, k], of which an output reads c * k * k.
+    # A weight is [o, d], or [o, c, k, k] for a convolution, where each output reads c * k * k.
     return module.weight[0].numel() + (module.bias is not None)
 
 
@@ -463,7 +462,7 @@ def rows_of(module: nn.Module, x: Tensor) -> Tensor:
         patches = F.unfold(x, module.kernel_size, module.dilation, padding, module.stride)
         return patches.transpose(1, 2).flatten(0, 1)  # [B, d, n] -> [B*n, d]
     if isinstance(module, nn.Conv3d):
-        # PyTorch unfolds no volumes; vision towers use these on one patch at a time.
+        # PyTorch cannot unfold volumes; vision towers apply these to one patch at a time.
         if tuple(x.shape[2:]) != module.kernel_size:
             raise AegisError(
                 f"a 3-D convolution over {tuple(x.shape[2:])} with a kernel of "
@@ -475,7 +474,7 @@ def rows_of(module: nn.Module, x: Tensor) -> Tensor:
     if isinstance(module, nn.Linear):
         return x.flatten(0, -2)
     if isinstance(module, nn.LayerNorm):
-        # Without weight and bias, this is what they multiply and shift.
+        # Computed without weight and bias: this is what they multiply and shift.
         return F.layer_norm(x, module.normalized_shape, eps=module.eps).flatten(0, -2)
     return structure.rms_normed(module, x).flatten(0, -2)
 
@@ -487,7 +486,7 @@ def _same(a: Tensor | None, b: Tensor | None) -> bool:
 
 
 def _first(arguments: tuple[Any, ...], named: Mapping[str, Any]) -> Any:
-    """What a module was called with, first or by name."""
+    """A module's first argument, whether passed by position or by name."""
     return arguments[0] if arguments else next(iter(named.values()), None)
 
 

@@ -1,10 +1,10 @@
-"""What has been measured of an anchor so far, so that an interrupted `aegis anchor` goes on.
+"""Save the progress of an anchor's measurement, so that an interrupted `aegis anchor` can resume.
 
-A piece is a part of the anchor, or of a part that is measured in groups of maps one group. Of a
-piece that is finished its result is kept, by the first process alone. Of the one under way each
-process keeps its own sums with how far they have come; it does so at most every minute, and so
-seldom that this takes a fiftieth of the time. Nothing shows in what is measured: sums go on
-from the very bits that they had. All of it is removed when the anchor is written.
+A piece is a part of the anchor, or one group of maps if a part is measured in groups. The first
+process saves the result of each finished piece. For the piece in progress, each process saves its
+own sums and how far they have come, at most once a minute and for at most a fiftieth of the time.
+Resuming does not change the result: sums continue from exactly the same bits. Everything is removed
+when the anchor is written.
 """
 
 from __future__ import annotations
@@ -23,28 +23,28 @@ from aegis_cli.common.events import OnEvent, Warned, ignore
 from aegis_cli.common.kept_tensors import Kept
 from aegis_cli.common.ranks import ALONE, Ranks
 
-_EVERY_S = 60.0  # at least between two times that sums are kept
-_TIMES = 50  # as long as it takes to keep them, the work before that takes at least
-_BYTES_PER_S = 2e8  # at which a disk is thought to write, until it has
-_OF_FREE = 0.25  # what is kept at once takes at most so much of the free disk
+_EVERY_S = 60.0  # at least, between two saves
+_TIMES = 50  # the work between two saves takes at least this many times as long as a save
+_BYTES_PER_S = 2e8  # assumed speed of the disk until the first save
+_OF_FREE = 0.25  # one save by all processes takes at most this share of the free disk
 _STAGE = "anchor"
 
 
 class Work:
-    """An anchor that is being measured, and what is kept of it.
+    """The saved state of an anchor that is being measured.
 
     Attributes:
-        before_s: seconds that what was found here took, before this process began.
+        before_s: seconds that earlier processes spent on the state that was found.
     """
 
     def __init__(
         self, about: Mapping[str, Any] | None, ranks: Ranks = ALONE, on_event: OnEvent = ignore
     ) -> None:
-        """Look for nothing yet.
+        """Prepare, without reading anything yet.
 
         Args:
-            about: all that the anchor depends on, as JSON: of another one nothing is found. None
-                keeps nothing.
+            about: everything that the anchor depends on, as JSON; only the state of an equal one is
+                found. None: nothing is saved.
         """
         self.before_s = 0.0
         self._ranks, self._on_event = ranks, on_event
@@ -55,20 +55,20 @@ class Work:
             files.sweep_all(self._folder)
 
     def piece(self, stage: str) -> Piece:
-        """One piece of the work, which is named as its progress is."""
+        """One piece of the work, named after its stage in progress events."""
         return Piece(self, stage)
 
     def remove(self) -> None:
-        """Remove all that is kept of this anchor, which is written by now."""
+        """Remove all saved state of this anchor, once the anchor is written."""
         if self._name is not None:
-            with contextlib.suppress(OSError):  # another process has removed it, or it is another's
+            with contextlib.suppress(OSError):  # already removed, or not ours to remove
                 for path in self._folder.glob(f"{self._name}-*"):
                     path.unlink()
 
     # --- for its pieces ---------------------------------------------------------------------------
 
     def read(self, name: str) -> Kept | None:
-        """What is kept under this name."""
+        """What is saved under this name."""
         if self._name is None:
             return None
         path = self._path(name)
@@ -84,10 +84,10 @@ class Work:
         return found
 
     def write(self, name: str, kept: Kept) -> bool:
-        """Keep something, where the disk has room for it.
+        """Save something if the disk has room for it.
 
         Returns:
-            Whether it is kept.
+            Whether it was saved.
         """
         if not self._can_keep:
             return False
@@ -107,7 +107,7 @@ class Work:
         return self._can_keep
 
     def forget(self, name: str) -> None:
-        """Remove what is kept under this name."""
+        """Remove what is saved under this name."""
         if self._name is not None:
             with contextlib.suppress(OSError):
                 self._path(name).unlink()
@@ -122,17 +122,17 @@ class Work:
 
 @dataclass
 class Piece:
-    """A part of an anchor, or of one that is measured in groups of maps a group."""
+    """A part of an anchor, or one group of maps if a part is measured in groups."""
 
     work: Work
     stage: str
-    _before_s: float = 0.0  # of an earlier process, on the sums that this one goes on with
+    _before_s: float = 0.0  # spent by earlier processes on the sums that this one continues
     _began_s: float = field(default_factory=time.monotonic)
 
     def finished(self) -> Kept | None:
         """The piece, if it is finished.
 
-        Processes other than the first, which write nothing, get its figures alone.
+        Processes other than the first get only its figures.
         """
         ranks = self.work._ranks
         if self.work._name is None or not ranks.several:
@@ -142,20 +142,20 @@ class Piece:
         return own if own is not None or figures is None else Kept(figures)
 
     def begun(self) -> Kept | None:
-        """This process's sums of a piece that is not finished; `figures["done"]` says how far."""
+        """This process's sums of an unfinished piece; `figures["done"]` says how far they are."""
         found = self.work.read(self._own)
         self._before_s = 0.0 if found is None else found.figures["seconds"]
         return found
 
     @contextlib.contextmanager
     def going(self, sums: Callable[[], Kept]) -> Generator[Callable[[int], None]]:
-        """Keep the sums while the work of the block goes on, and when a signal ends it.
+        """Save the sums regularly while the block runs, and when a signal ends it.
 
         Args:
-            sums: what they are at the moment.
+            sums: returns the current sums.
 
         Yields:
-            What is to be called wherever the sums are whole, with how far the work has come.
+            A function to call, with how much is done, whenever the sums are consistent.
         """
         if not self.work._can_keep:
             yield lambda done: None
@@ -187,7 +187,7 @@ class Piece:
         self.work._on_event(Warned(_STAGE, text))
 
     def finish(self, kept: Kept) -> None:
-        """Keep the result in place of the sums; all processes call this together."""
+        """Save the result in place of the sums; all processes call this together."""
         if self.work._name is None:
             return
         whole = self._named("whole")

@@ -1,4 +1,4 @@
-"""`aegis anchor`: measure the pre-trained VLM on questions, or on robot frames, once."""
+"""`aegis anchor`: measure the pre-trained VLM once, on questions or on robot frames."""
 
 from __future__ import annotations
 
@@ -30,8 +30,9 @@ from aegis_cli.models import backbones
 from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.recipes import Anchor as Settings
 
-# The fewest with which `aegis`, which reads moments alone, and `nullspace`, which reads directions,
-# kept about as much as with 3,000 samples (docs/results/ablations.md). `kfac` lost more with 300.
+# The fewest samples with which `aegis`, which reads only moments, and `nullspace`, which reads
+# directions, kept about as much as with 3,000 (docs/results/ablations.md). `kfac` lost more with
+# 300.
 FEWEST_FOR_MOMENTS, FEWEST = 30, 300
 
 
@@ -40,16 +41,16 @@ class AnchorReport:
     """What was measured, and what it cost.
 
     Attributes:
-        samples: questions, or frames; at most as many as were asked for, where files hold fewer.
+        samples: questions or frames; fewer than requested if the files hold fewer.
         skipped: bad questions that were left out.
         image_tokens, text_tokens: valid tokens in the moments; None without moments.
         layers: layers in the moments; None without moments.
         directions: share of the directions of all maps' inputs whose eigenvectors were kept; None
             without inputs.
-        entropy: of the answers' words by the backbone's own distribution, in nats a word; None
-            without curvature.
-        seconds: wall time by part, without rendering the questions; with that before an
-            interruption, as far as its work was kept.
+        entropy: entropy of the backbone's own distribution over the answers' words, in nats per
+            word; None without curvature.
+        seconds: wall time by part, without rendering the questions; includes the time before an
+            interruption if its work was kept.
         megabytes: size of the file, in 10^6 bytes.
     """
 
@@ -78,25 +79,25 @@ def run(
     selection: Selection = ALL,
     keep: bool = True,
 ) -> AnchorReport:
-    """Measure the parts asked for on `settings.samples` questions with images and answers.
+    """Measure the requested parts on `settings.samples` questions with images and answers.
 
-    Files give at most as many as they hold. It runs in float32, so that neither the batch size nor
-    the number of processes shows in what is measured; where a share of the tokens is read
-    (`settings.tokens`), which ones are drawn depends on both.
+    If files hold fewer questions, all of them are used. Passes run in float32, so the result
+    depends neither on the batch size nor on the number of processes; if only a share of the tokens
+    is read (`settings.tokens`), which tokens are drawn depends on both.
 
-    Where torchrun has started several processes, each calls this, and they share the passes.
+    If torchrun has started several processes, each calls this, and they share the passes.
 
-    What is measured is kept in the cache until the anchor is written: called again with the same
-    inputs after an interruption, it goes on, to the same bytes on a CPU.
+    Progress is saved in the cache until the anchor is written. A call with the same inputs after an
+    interruption resumes, and on a CPU gives the same bytes.
 
     Args:
         demos: with the source `demos`, the demonstrations whose frames are read instead, each with
             its instruction.
-        selection: which of their frames; nothing but pictures and instructions is read.
-        keep: whether it is kept, and what was kept before is taken.
+        selection: which of their frames; only images and instructions are read.
+        keep: whether progress is saved, and saved progress is used.
 
     Raises:
-        AegisError: inputs that cannot be read, or parts that frames do not tell.
+        AegisError: inputs that cannot be read, or parts that cannot be measured on frames.
     """
     with joined() as ranks:
         _warn_of_unread(settings, on_event)
@@ -122,7 +123,7 @@ def run(
         return report
 
 
-# The parts each of which reads a setting that others do not.
+# Setting -> the part that reads it, for settings that only one part reads.
 _READ_BY = {
     "energy": ("inputs", "curvature"),
     "exact_width": ("inputs", "curvature"),
@@ -134,7 +135,7 @@ _READ_BY = {
 
 
 def _warn_of_unread(settings: Settings, on_event: OnEvent) -> None:
-    """Warn of settings of parts that are not measured."""
+    """Warn about settings of parts that are not measured."""
     for name, parts in _READ_BY.items():
         value = getattr(settings, name)
         if value != getattr(Settings(), name) and not set(parts) & set(settings.parts):
@@ -146,7 +147,7 @@ def _warn_of_unread(settings: Settings, on_event: OnEvent) -> None:
 
 
 def _warn_of_few(samples: int, settings: Settings, on_event: OnEvent) -> None:
-    """Warn of an anchor that too few samples have made."""
+    """Warn about an anchor measured on too few samples."""
     others = sorted(set(settings.parts) - {"moments"})
     fewest = FEWEST if others else FEWEST_FOR_MOMENTS
     if samples >= fewest:
@@ -178,7 +179,7 @@ def _written(measured: _Measured, settings: Settings, out: Path) -> AnchorReport
             **({} if settings.temperature == 1 else {"temperature": settings.temperature}),
         },
     )
-    # Every layer sees the same tokens, so the first one's count is that of all.
+    # Every layer sees the same tokens, so the first layer's count holds for all.
     image, text = (found[0].count if found else None for found in (anchor.image, anchor.text))
     return AnchorReport(
         samples=measured.samples,
@@ -197,13 +198,13 @@ def _written(measured: _Measured, settings: Settings, out: Path) -> AnchorReport
 
 @dataclass(frozen=True)
 class _Measured:
-    """An anchor and what its file says of it.
+    """An anchor and what its file says about it.
 
     Attributes:
-        inputs: sha256 of what it was measured on, by a name for it.
-        meta: what that is called.
-        work: what is kept until the anchor is written.
-        entropy: of the answers, in nats a word; None without curvature.
+        inputs: name -> sha256 of the data it was measured on.
+        meta: how that data is named in the file's header.
+        work: the progress that is saved until the anchor is written.
+        entropy: entropy of the answers, in nats per word; None without curvature.
     """
 
     anchor: Anchor
@@ -232,7 +233,7 @@ def _on_questions(
     fingerprint = ranks.by_first(model.fingerprint)
 
     def read() -> dict[str, Any]:
-        # Their order, and which of them are about one image, decide how they are passed.
+        # Their order, and which of them share an image, decide the batches.
         shown = [digests.of_questions(asked), asked.image_of.tolist()]
         return {"questions": files.sha256_value(shown)}
 
@@ -261,10 +262,10 @@ def _about(
     ranks: Ranks,
     read: Callable[[], Mapping[str, Any]],
 ) -> dict[str, Any]:
-    """All that a measurement depends on, by which what is kept of it is found.
+    """Everything that a measurement depends on, by which its saved progress is found.
 
     Args:
-        read: tells what the backbone reads; the first process alone is asked.
+        read: returns what identifies the data; called by the first process only.
     """
     return {
         "weights": fingerprint,
@@ -293,12 +294,12 @@ def _on_frames(
     mixture.check_rename((demos,), selection.rename)
     with loading_told("anchor", on_event):
         model = backbones.load(backbone).to(devices.pick())
-    # None: all episodes are held out from training, so that all their frames are in `validation`.
+    # None: all episodes are held out from training, so all their frames are in `validation`.
     found = demonstrations.load(
         demos, None, 0, selection, model.image_size, on_event=on_event, cache=False
     )
     order = np.random.default_rng(settings.seed).permutation(len(found.validation))
-    # Drawn at random and read in their order, as videos are decoded.
+    # Drawn at random, but read in order, since videos are decoded in order.
     frames = found.validation[torch.from_numpy(np.sort(order[: settings.samples]))]
     fingerprint = ranks.by_first(model.fingerprint)
     of = {"demos": found.sha256, "frames": frames.tolist(), "selection": repr(selection)}
@@ -330,7 +331,11 @@ def _on_frames(
 
 
 def _check_frames(settings: Settings, demos: Path | None) -> Path:
-    """The demonstrations; parts that need answers are refused, and frames of nothing."""
+    """The demonstrations' path.
+
+    Raises:
+        AegisError: parts that need answers, or no demonstrations.
+    """
     others = sorted(set(settings.parts) - {"moments"})
     if others:
         raise AegisError(
@@ -349,11 +354,11 @@ def _check_frames(settings: Settings, demos: Path | None) -> Path:
 
 @dataclass(frozen=True)
 class _PartMeasurement:
-    """The questions that each part is measured on, and what with.
+    """The questions that each part is measured on, and how.
 
     Attributes:
-        work: what is kept of the parts.
-        entropy: what counts the answers of the curvature.
+        work: the saved progress of the parts.
+        entropy: counts the answers of the curvature.
     """
 
     model: Backbone
@@ -365,7 +370,7 @@ class _PartMeasurement:
     entropy: curvature.AnswerEntropy
 
     def parts(self) -> tuple[Anchor, dict[str, float]]:
-        """The parts asked for, always in one order, and the seconds each took."""
+        """The requested parts, always in the same order, and the seconds each took."""
         measures = {
             "moments": self._moments,
             "inputs": self._inputs,
@@ -383,7 +388,7 @@ class _PartMeasurement:
 
     def _moments(self) -> tuple[list[Moments], list[Moments]]:
         count, size = len(self.asked.questions), self.settings.batch_size
-        # By their rows: of a batch that was passed before, no image is decoded again.
+        # As rows, so that no image is decoded for a batch that was passed before.
         batches = [slice(first, first + size) for first in range(0, count, size)]
 
         def read(rows: slice) -> moments.Read:

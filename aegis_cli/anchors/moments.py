@@ -19,20 +19,20 @@ from aegis_cli.data.batch import Images
 from aegis_cli.data.vqa.images import tensors
 from aegis_cli.models.backbones.base import Backbone
 
-if TYPE_CHECKING:  # the guard comes here, and has no use for a renderer of scenes
+if TYPE_CHECKING:  # the guard imports this module and needs no scene renderer
     import numpy as np
 
     from aegis_cli.data.vqa.questions import Question
 
 Item = TypeVar("Item")
-Read = tuple[Images, Sequence[str]]  # images, each with a text that it is read with
+Read = tuple[Images, Sequence[str]]  # images, and the text of each
 
 
 class MomentRecorder:
-    """Adds up the moments of hidden states, of image tokens and of text tokens apart.
+    """Adds up the moments of hidden states, separately for image tokens and text tokens.
 
     Attributes:
-        image, text: the moments so far of each layer; empty before the first pass.
+        image, text: each layer's moments so far; empty before the first pass.
     """
 
     def __init__(self) -> None:
@@ -44,20 +44,20 @@ class MomentRecorder:
 
         Args:
             hidden: each layer's output, L tensors [B, T, D].
-            mask: [B, T] bool; where it is false nothing counts.
+            mask: [B, T] bool, true at tokens that count.
             image: [T] or [B, T] bool, true at image tokens.
         """
         nothing = [empty(h.shape[-1]) for h in hidden]
-        # Apart, because which of the two is compared is an option of a method (`scope`).
+        # Separately, because a method's option (`scope`) says which of the two is compared.
         self.image = add_moments(self.image or nothing, hidden, mask & image)
         self.text = add_moments(self.text or nothing, hidden, mask & ~image)
 
     def kept(self) -> Kept:
-        """The moments so far, to be kept."""
+        """The moments so far, for saving."""
         return _to_keep(self.image, self.text)
 
     def restore(self, kept: Kept, device: torch.device) -> None:
-        """Go on from moments that were kept."""
+        """Continue from saved moments."""
         found = _from_kept(kept)
         self.image, self.text = ([layer.to(device) for layer in layers] for layers in found)
 
@@ -74,9 +74,9 @@ def measure(
     Padding does not count.
 
     Args:
-        batches: images and as many questions about them.
-        total: how many questions there are, for the progress.
-        ranks: the processes that take turns in passing a batch.
+        batches: images, with one question about each.
+        total: the number of questions, for progress events.
+        ranks: the processes, which take batches in turn.
     """
 
     def read(batch: tuple[np.ndarray | list[np.ndarray], Sequence[Question]]) -> Read:
@@ -96,14 +96,14 @@ def measure_passes(
     ranks: Ranks = ALONE,
     work: kept_work.Work = kept_work.NOTHING,
 ) -> tuple[list[Moments], list[Moments]]:
-    """The moments of each layer over image and text tokens, of images that are read with texts.
+    """The moments of each layer over image and text tokens, for images that are read with texts.
 
     Args:
-        batches: in which they are passed; `read` finds one's images and texts, for a GPU in several
-            threads.
-        total: how many there are, for the progress.
-        ranks: the processes that take turns in passing a batch.
-        work: what is kept of an interrupted measurement, and of this one.
+        batches: the batches to pass; `read` returns the images and texts of one, in several threads
+            if the model is on a GPU.
+        total: the number of questions or frames, for progress events.
+        ranks: the processes, which take batches in turn.
+        work: the saved state of an interrupted measurement, and of this one.
     """
     piece = work.piece("anchor")
     if (known := piece.finished()) is not None:
@@ -118,7 +118,7 @@ def measure_passes(
         found = recorder.kept()
         return Kept({**found.figures, "samples": done}, found.tensors)
 
-    # Whole batches in turns: merging is associative, so that who passed which does not matter.
+    # The processes take whole batches in turn; merging is associative, so the split has no effect.
     own = itertools.islice(batches, ranks.rank + before * ranks.count, None, ranks.count)
     on_event(Progress("anchor", done, total, "samples"))
     with (
@@ -133,7 +133,7 @@ def measure_passes(
             on_event(Progress("anchor", done, total, "samples"))
     image: list[Moments] = []
     text: list[Moments] = []
-    # Those of several processes, each of which may have its own GPU, can be merged on the CPU.
+    # Each process may have its own GPU, so their moments are merged on the CPU.
     cpu = torch.device("cpu")
     measured = [[layer.to(cpu) for layer in found] for found in (recorder.image, recorder.text)]
     for of_image, of_text in ranks.gathered(measured):
@@ -153,7 +153,7 @@ def _to_keep(image: Sequence[Moments], text: Sequence[Moments]) -> Kept:
 
 
 def _from_kept(kept: Kept) -> tuple[list[Moments], list[Moments]]:
-    """The moments over image and text tokens; none for a process that has figures alone."""
+    """The moments over image and text tokens; none for a process that has only figures."""
 
     def layers(name: str) -> list[Moments]:
         return [
@@ -165,7 +165,7 @@ def _from_kept(kept: Kept) -> tuple[list[Moments], list[Moments]]:
 
 
 def _merged(found: list[Moments], more: list[Moments]) -> list[Moments]:
-    """The moments of both, layer by layer; a process that had no batch knows no layers."""
+    """The moments of both, layer by layer; a process without a batch has no layers."""
     if not found or not more:
         return found or more
     return [merge(a, b) for a, b in zip(found, more, strict=True)]

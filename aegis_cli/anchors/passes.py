@@ -15,18 +15,18 @@ from aegis_cli.data.vqa.images import tensors
 from aegis_cli.models.backbones.base import AnswerScores, Backbone
 from aegis_cli.models.structure import Maps
 
-if TYPE_CHECKING:  # the guard comes here, and has no use for a renderer of scenes
+if TYPE_CHECKING:  # the guard imports this module and needs no scene renderer
     from aegis_cli.data.vqa.dataset import VQASet
 
-IMAGES = 32  # in a pass at most: the unfolded patches of a convolution take a few MB an image
-QUESTIONS = 8  # at most, where each takes a pass of its image of its own
+IMAGES = 32  # per pass at most: the unfolded patches of a convolution take a few MB per image
+QUESTIONS = 8  # per pass at most, if the image is passed again for each question
 
 
 def maps_of(model: Backbone) -> Maps:
-    """The maps of a backbone as its family names them, where `structure.find_maps` would guess.
+    """The maps of a backbone as its family names them, unlike `structure.find_maps`, which guesses.
 
     Raises:
-        AegisError: modules whose parameters are used in a way that no inputs describe.
+        AegisError: modules whose parameters are used in a way that their inputs do not describe.
     """
     return Maps(kinds=model.sites(), twins={}, heads=dict(model.tied_heads), unknown={})
 
@@ -36,13 +36,14 @@ def groups(
 ) -> Iterator[tuple[Maps, str]]:
     """The maps of a backbone in groups whose sums take up to `memory` bytes, and a name for each.
 
-    Maps of one module stay together, since they may share a sum; so do those of a group that is too
-    large by itself. What they share is not known beforehand: the sums take at most so much.
+    Maps of one parent module stay together, since they may share a sum, even if they exceed
+    `memory` by themselves. What they share is not known beforehand, so the sums take at most that
+    much.
 
     Args:
-        stage: the name, to which the number of the group is added where there are several.
+        stage: the name, to which the number of the group is added if there are several.
         memory: None: all maps are one group.
-        size: bytes of a module's sums.
+        size: returns the bytes of a module's sums.
 
     Raises:
         AegisError: see `maps_of`.
@@ -61,7 +62,7 @@ def groups(
             found.append([])
             left = memory or 0
         found[-1] += sites
-        left -= needed  # below 0 after a module that is too large by itself: the next group begins
+        left -= needed  # below 0 after a module that is too large by itself: a new group follows
     for number, sites in enumerate(found, start=1):
         kinds = {site: whole.kinds[site] for site in sites}
         heads = {table: head for table, head in whole.heads.items() if table in kinds}
@@ -70,7 +71,7 @@ def groups(
 
 
 def tell_known(asked: VQASet, stage: str, on_event: OnEvent) -> None:
-    """Tell that this was passed before, and what came of it is known."""
+    """Report that an earlier process has passed this set, and that its result is used."""
     on_event(Progress(stage, len(asked.images), len(asked.images), "images"))
 
 
@@ -87,9 +88,9 @@ def run(
     """Pass the whole set, up to `batch_size` images at a time with all their questions.
 
     Args:
-        ranks: the processes that pass a part of the images each.
-        done: how many of its part this process has passed before.
-        passed: called with how many these are, each time that all scores of a batch were taken.
+        ranks: the processes, each of which passes a share of the images.
+        done: how many images of its share this process has passed before.
+        passed: called with that number each time all scores of a batch were taken.
 
     Yields:
         The scores of the answers' words, part by part, with the number of each question in the set.

@@ -1,4 +1,4 @@
-"""Second moments by name, summed over passes, and the spectra that an anchor keeps of them."""
+"""Second moments by name, summed over passes, and the spectra that an anchor stores."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from aegis_cli.core import moment_sums
 from aegis_cli.core.moment_sums import MomentSum
 from aegis_cli.core.spectrum import Spectrum, decompose
 
-# The cure for activations that are not finite.
+# What an error advises if activations are not finite.
 FINITE = "measure the model in float32 or bfloat16, since float16 ends at 65,504"
 Readers = tuple[str, ...]  # names of maps that have read the same rows, in alphabetical order
 
@@ -24,14 +24,15 @@ Readers = tuple[str, ...]  # names of maps that have read the same rows, in alph
 class SecondMoments:
     """Sums of second moments, which depend neither on batch size nor on order.
 
-    Maps that read the same rows share one sum and, where they always do, one spectrum.
+    Maps that read the same rows share one sum and, if they always do, one spectrum.
     """
 
     def __init__(self, whole: int = moment_sums.WHOLE) -> None:
-        """Begin without rows.
+        """Start without rows.
 
         Args:
-            whole: widest rows whose second moment is summed whole; wider ones are sketched.
+            whole: largest width of rows whose second moment is summed in full; wider ones are
+                sketched.
         """
         self._whole = whole
         self._rows: dict[Readers, MomentSum] = {}
@@ -47,15 +48,15 @@ class SecondMoments:
         """Add the summed moment of `count` rows.
 
         Args:
-            moment: float64; [D, m, m] of a normalisation with m of scale and shift, [N] of a
-                table's rows.
+            moment: float64; [D, m, m] for a normalisation, m counting its scale and shift, or [N]
+                for a table's rows.
         """
         self._small[name] = self._small[name] + moment if name in self._small else moment
         self._counts[name] = self._counts.get(name, 0) + count
 
     def add_rows(self, names: Iterable[str], rows: Tensor, convolution: bool = False) -> None:
         """Add x x^T of rows x [n, d] that these maps have read."""
-        # Whichever of them came first, it is the same sum.
+        # Sorted, so that the sum does not depend on which of them came first.
         readers = tuple(sorted(names))
         if readers not in self._rows:
             self._begin(readers, rows.shape[1], convolution, rows.device)
@@ -64,7 +65,7 @@ class SecondMoments:
             self._counts[name] = self._counts.get(name, 0) + len(rows)
 
     def kept(self) -> Kept:
-        """The sums so far, to be kept."""
+        """The sums so far, for saving."""
         tensors: dict[str, Tensor] = {}
         rows = []
         for place, (readers, moment) in enumerate(self._rows.items()):
@@ -72,12 +73,12 @@ class SecondMoments:
             rows.append([readers, *self._widths[readers], len(parts)])
             tensors |= {f"rows.{place}.{i}": part for i, part in enumerate(parts)}
         tensors |= {f"small.{name}": moment for name, moment in self._small.items()}
-        # In their order, by which spectra come and sums are added to others.
+        # In order, since spectra are listed and sums are added across processes in this order.
         figures = {"rows": rows, "small": list(self._small), "counts": list(self._counts.items())}
         return Kept(figures, tensors)
 
     def restore(self, kept: Kept, device: torch.device) -> None:
-        """Go on from sums that were kept, before any of one's own."""
+        """Continue from saved sums, before anything else is added."""
         for place, (names, width, convolution, count) in enumerate(kept.figures["rows"]):
             parts = [kept.tensors[f"rows.{place}.{i}"].to(device) for i in range(count)]
             self._begin(tuple(names), width, convolution, device)
@@ -90,14 +91,14 @@ class SecondMoments:
         self._widths[readers] = width, convolution
 
     def add_up(self, ranks: Ranks) -> None:
-        """Make every sum that over the passes of all processes.
+        """Sum over the passes of all processes.
 
         Raises:
-            AegisError: a process whose questions have used other maps.
+            AegisError: a process whose questions used other maps.
         """
         if not ranks.several:
             return
-        # Sums are added by their place, so that all processes have to have the same in one order.
+        # Sums are added by position, so all processes must have the same sums in the same order.
         names = [list(self._rows), list(self._small), list(self._counts)]
         if any(theirs != names for theirs in ranks.gathered(names)):
             raise AegisError(
@@ -112,7 +113,7 @@ class SecondMoments:
         self._counts = {name: sum(own[name] for own in counts) for name in self._counts}
 
     def check(self, names: Iterable[str]) -> None:
-        """Raise AegisError unless each of them has rows."""
+        """Raise AegisError unless each of these names has rows."""
         if missing := [name for name in names if name not in self._counts]:
             raise AegisError(
                 f"{', '.join(missing)} took no part in these questions",
@@ -130,22 +131,22 @@ class SecondMoments:
     ) -> dict[str, Spectrum]:
         """The spectrum of each mean moment, by its name.
 
-        They come in the order of their first rows. Maps that have always read the same rows have
-        one and the same spectrum.
+        They come in the order of their first rows. Maps that always read the same rows share one
+        spectrum object.
 
         Args:
             energy: share of each moment's trace up to which eigenvectors are kept.
-            leave_out: names of moments that do not count.
-            release: forget each sum when its spectrum is found, so that not all are in memory at
+            leave_out: names of moments to ignore.
+            release: release each sum when its spectrum is found, so that not all are in memory at
                 the same time.
-            stage: what the progress is called; of a large model they take minutes.
+            stage: name of the stage in progress events; for a large model this takes minutes.
 
         Raises:
             AegisError: a sum that is not finite.
         """
         names = [name for name in self._counts if name not in leave_out]
         # A map may have read alone in one pass and together with others in another. Its moment is
-        # the total of all sums that it is a reader of, and the same sums give the same spectrum.
+        # the total of all sums it contributed to, and the same sums give the same spectrum.
         sums_of = {name: tuple(r for r in self._rows if name in r) for name in names}
         last_use: dict[Readers, str] = {}
         for name, sums in sums_of.items():
@@ -175,11 +176,11 @@ class SecondMoments:
 
 
 def shared(spectra: Mapping[str, Spectrum]) -> dict[str, str]:
-    """The names whose spectrum is that of an earlier name -> that name."""
+    """Names that share the spectrum of an earlier name -> that earlier name."""
     first: dict[int, str] = {}
     followers = {}
     for name, spectrum in spectra.items():
-        # One object for all that share it: equal values would not tell, and take long to compare.
+        # Shared spectra are one object; comparing values would be slow and would prove nothing.
         leader = first.setdefault(id(spectrum), name)
         if leader != name:
             followers[name] = leader
@@ -187,7 +188,7 @@ def shared(spectra: Mapping[str, Spectrum]) -> dict[str, str]:
 
 
 def to_keep(spectra: Mapping[str, Spectrum]) -> Kept:
-    """Spectra as they are kept, each once for all that share it."""
+    """Spectra for saving; a shared one is stored once."""
     followers = shared(spectra)
     tensors: dict[str, Tensor] = {}
     for name, spectrum in spectra.items():
@@ -200,7 +201,7 @@ def to_keep(spectra: Mapping[str, Spectrum]) -> Kept:
 
 
 def from_kept(kept: Kept) -> dict[str, Spectrum]:
-    """The spectra that were kept; none for a process that has figures alone."""
+    """The saved spectra; none for a process that has only figures."""
     found: dict[str, Spectrum] = {}
     for name, leader, whole in kept.figures["spectra"] if kept.tensors else ():
         if leader != name:
@@ -212,7 +213,7 @@ def from_kept(kept: Kept) -> dict[str, Spectrum]:
 
 
 def _check_finite(name: str, parts: Iterable[Tensor]) -> None:
-    """Raise AegisError for a sum of which no eigenvectors can be found."""
+    """Raise AegisError for a sum that is not finite, which has no eigenvectors."""
     if not all(part.isfinite().all() for part in parts):
         raise AegisError(
             f"a second moment of '{name}' that is not finite",
@@ -223,6 +224,6 @@ def _check_finite(name: str, parts: Iterable[Tensor]) -> None:
 
 def _small(mean: Tensor, energy: float) -> Spectrum:
     if mean.ndim == 1:
-        # A look-up of a table's row serves any number of texts, so only whether it is read counts.
+        # Any number of texts may look up the same row, so only whether it is read counts.
         return Spectrum((mean > 0).to(torch.float64), None)
     return decompose(mean, energy)

@@ -1,4 +1,4 @@
-"""What a measurement depends on beside the model and the data, by which kept ones are found."""
+"""What a measurement depends on besides model and data; saved measurements are found by it."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ _PLAY = (*_ANSWER, "mujoco", "dm-control", "metaworld", "hf-libero", "robosuite"
 
 
 def of_answers() -> dict[str, str]:
-    """The code, the libraries, and what computes; another processor may round otherwise."""
+    """The code, the libraries and the device; another processor may round differently."""
     return _with(_ANSWER)
 
 
 def of_episodes(renderer: str) -> dict[str, str]:
-    """The same, with the simulators and what draws their pictures."""
+    """The same, with the simulators and their renderer."""
     return {"renderer": renderer, **_with(_PLAY)}
 
 

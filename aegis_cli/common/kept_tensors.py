@@ -1,8 +1,8 @@
-"""Files of the cache with figures and tensors, which come back bit for bit or not at all.
+"""Cache files with figures and tensors, which are read back bit for bit or not at all.
 
-A file begins with the length of its head (8 bytes) and the head, JSON with the figures and with
-each tensor's name, type and shape. The tensors follow, one after the other, and a sha256 of all
-that stands before it.
+A file begins with the length of its head (8 bytes) and the head: JSON with the figures and with
+each tensor's name, dtype and shape. The tensors follow, one after the other, then a sha256 of
+everything before it.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ _DIGEST = hashlib.sha256().digest_size
 
 @dataclass(frozen=True)
 class Kept:
-    """What work has found.
+    """Saved results.
 
     Attributes:
-        figures: JSON.
-        tensors: on any device; those that were read are on the CPU.
+        figures: JSON values.
+        tensors: on any device; after reading, on the CPU.
     """
 
     figures: Mapping[str, Any]
@@ -42,11 +42,11 @@ class Kept:
 
 
 class Damaged(Exception):
-    """A file that is not as it was written."""
+    """A file whose contents are not what was written."""
 
 
 def write(path: Path, kept: Kept) -> None:
-    """Write such a file: all of it, or nothing.
+    """Write such a file, all or nothing.
 
     Raises:
         AegisError: it cannot be written.
@@ -55,10 +55,10 @@ def write(path: Path, kept: Kept) -> None:
 
 
 def read(path: Path) -> Kept | None:
-    """What a file holds; None where there is none that this user may read.
+    """What a file holds; None if there is no file that this user may read.
 
     Raises:
-        Damaged: it is not as it was written.
+        Damaged: its contents are not what was written.
     """
     try:
         with open(path, "rb") as file:
@@ -82,7 +82,7 @@ def _write(file: BinaryIO, kept: Kept) -> None:
             digest.update(part)
             yield memoryview(part)
         for tensor in kept.tensors.values():
-            # A GPU's come to the CPU one at a time.
+            # Tensors of a GPU are moved to the CPU one at a time.
             values = _bytes(tensor.detach().cpu().contiguous())
             digest.update(values)
             yield values
@@ -125,9 +125,9 @@ def _tensor(
 
 
 def _checked(file: BinaryIO, size: int) -> int:
-    """A number of bytes, if a file still has as many before its digest.
+    """Return `size` if the file has that many bytes left before its digest, else raise.
 
-    Otherwise a damaged length would ask for any amount of memory.
+    Without this check a damaged length could ask for any amount of memory.
     """
     left = os.fstat(file.fileno()).st_size - file.tell() - _DIGEST
     if not 0 <= size <= left:

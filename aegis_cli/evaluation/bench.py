@@ -1,4 +1,4 @@
-"""`aegis bench`: the cost of each part, as ratios of times taken in turn and of peak memories.
+"""`aegis bench`: the cost of each part, as ratios of alternately measured times and of peak memory.
 
 The ratios are those of this machine.
 """
@@ -28,10 +28,10 @@ from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.recipes import Anchor, Recipe
 
 _SAMPLES = 70  # questions of the anchor: a step's cost does not depend on their number
-# Co-training has so many questions that, as in a real run, other processes render them and keep
+# Enough co-training questions that, as in a real run, other processes render them and hold
 # OpenGL's memory.
 _QUESTIONS = 2500
-_MEMORY_TURNS = 3  # the optimizer's state is there from the second step on
+_MEMORY_TURNS = 3  # the optimizer's state exists from the second step on
 T = TypeVar("T")
 
 
@@ -51,14 +51,14 @@ class Cost:
 class BenchReport:
     """Medians of `repeats` rounds.
 
-    Each round times every part, each step of a method right beside one of naive's, so that a busy
-    machine slows all alike.
+    Each round times every part, each step of a method right next to one of naive's, so that other
+    load on the machine slows both equally.
 
     Attributes:
-        anchor_throughput: share of a bare forward's throughput that measuring an anchor's moments
-            has.
+        anchor_throughput: throughput of measuring an anchor's moments, relative to that of a bare
+            forward pass.
         step_time, peak_memory: each method's training step over naive's; step_s: its seconds.
-        guard: None for a Hugging Face backbone, and where methods or keys were chosen.
+        guard: None for a Hugging Face backbone, and if methods or keys were chosen.
     """
 
     anchor_throughput: float
@@ -84,15 +84,15 @@ def run(
 ) -> BenchReport:
     """Compare the anchor pass with a bare forward, and each method's training step with naive's.
 
-    Each method runs at its defaults, unless they are overridden.
+    Each method runs with its defaults unless they are overridden.
 
     Args:
-        guard: the class of the guard, which is built on stages, to be timed over an embedded VLM.
-        chosen: methods; all where there are none. `naive` is always among them.
-        overrides: `key=value` of the recipe, as `--set` has them.
+        guard: the guard's class, passed in since it is built on stages; timed on an embedded VLM.
+        chosen: methods; empty: all. `naive` is always among them.
+        overrides: `key=value` of the recipe, as for `--set`.
 
     Raises:
-        AegisError: a method or key that there is not, or a process that died.
+        AegisError: an unknown method or key, or a process that died.
     """
     shared = {
         "backbone": backbone,
@@ -108,7 +108,7 @@ def run(
         "anchor": lambda: _moments(model, images, texts),
     }
     taken = bench_runs.take_turns("bench anchor", passes, repeats, on_event)
-    # One anchor for all methods, with the parts that any of them reads.
+    # One anchor for all methods, with every part that some method reads.
     needed = {part for name in recipes for part in methods.get(name).needs}
     settings = Anchor(
         samples=_SAMPLES, parts=tuple(sorted(needed)) or ("moments",), fisher_samples=7
@@ -140,8 +140,8 @@ def compare(
     """What training by each recipe costs, on random frames.
 
     Args:
-        recipes: by name, "naive" among them; `train.method` says which method each stands for.
-        anchor: file with whatever the methods need.
+        recipes: by name, including "naive"; `train.method` is the method that each stands for.
+        anchor: file with the parts that the methods need.
 
     Raises:
         AegisError: a recipe and an anchor that do not fit together, or a process that died.
@@ -167,13 +167,13 @@ def compare(
 def _step_times(
     recipes: Mapping[str, Recipe], anchor: Path, out: Path, repeats: int, on_event: OnEvent
 ) -> tuple[float, dict[str, float]]:
-    """Seconds of one of naive's training steps, and by recipe the ratio of its steps to them.
+    """Seconds of one of naive's training steps, and by recipe the ratio of its steps to that.
 
-    This is a function so that its models are gone when memory is measured.
+    This is a function of its own so that its models are freed before memory is measured.
     """
     steps = {name: bench_runs.stepper(recipe, anchor, out) for name, recipe in recipes.items()}
     naive = steps[NAIVE]
-    # Alone, naive is timed beside itself.
+    # If naive is the only recipe, it is timed against itself.
     others = {name: one for name, one in steps.items() if name != NAIVE} or {NAIVE: naive}
     naive_s, ratios = bench_runs.beside("bench steps", naive, others, repeats, on_event)
     return naive_s, {name: 1.0 if name == NAIVE else ratios[name] for name in steps}
@@ -187,7 +187,7 @@ def _forward(model: Backbone, images: torch.Tensor, texts: list[str]) -> object:
 def _moments(
     model: Backbone, images: torch.Tensor, texts: list[str]
 ) -> tuple[list[Moments], list[Moments]]:
-    """What `aegis anchor` does with a batch for the moments."""
+    """What `aegis anchor` does with a batch to measure the moments."""
     questions = [Question("", text, "") for text in texts]
     return moments.measure(model, [(images.numpy(), questions)], len(texts))
 
@@ -196,7 +196,7 @@ def _moments(
 
 
 def in_new_process(function: Callable[..., T], *arguments: Any) -> T:
-    """What a function of a module returns in a process of its own; what it raises is raised here.
+    """Run a function in a new process; return what it returns, raise what it raises.
 
     Raises:
         AegisError: the process died.
@@ -207,9 +207,9 @@ def in_new_process(function: Callable[..., T], *arguments: Any) -> T:
 
 
 def peak_memory(recipe: Recipe, anchor: Path, out: Path) -> int:
-    """Bytes that this process needed at most after a few steps, on the GPU if there is one.
+    """Peak memory of this process after a few steps in bytes, on the GPU if there is one.
 
-    A maximum never falls again, so each recipe needs a new process.
+    The peak never falls again, so each recipe needs a new process.
     """
     steps = bench_runs.stepper(recipe, anchor, out)
     for _ in range(_MEMORY_TURNS):

@@ -1,4 +1,4 @@
-"""What the guard costs in a user's loop, in turn with training's own steps and a plain backward."""
+"""What the guard costs in a user's loop, timed against `aegis train` and a plain backward pass."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ MakeGuard = Callable[..., Any]
 class GuardCost:
     """What the guard costs in a plain loop over the embedded VLM, as ratios.
 
-    `step_time` is a whole step of that loop over `aegis train`'s with the same method; `backward`
-    is `guard.backward` of `aegis`, that is two backward passes and a projection, over
-    `loss.backward()`.
+    `step_time` is a whole step of that loop over a step of `aegis train` with the same method.
+    `backward` is `guard.backward` with the method `aegis` (two backward passes and a projection)
+    over `loss.backward()`.
     """
 
     step_time: dict[str, float]
@@ -44,7 +44,7 @@ def guard_cost(
     """Time the guard against training and against a plain backward pass, all in the same rounds.
 
     Args:
-        recipes: by method, `aegis` among them.
+        recipes: by method, including `aegis`.
     """
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder)
@@ -58,7 +58,7 @@ def guard_cost(
             parts[f"guard {name}"] = partial(loop.steps, training.in_turn)
             if name == "aegis":
                 parts |= {"backward": loop.plain_backward, "guard.backward": loop.backward}
-                # A backward pass uses its graph up, so each has a forward pass, which is not timed.
+                # A backward pass frees its graph, so each follows a forward pass, which is untimed.
                 before |= {"backward": loop.forward, "guard.backward": loop.forward}
         seconds = bench_runs.take_turns("bench guard", parts, repeats, on_event, before)
     return GuardCost(
@@ -68,7 +68,7 @@ def guard_cost(
 
 
 class _PlainLoop:
-    """A user's loop with a guard, over the parts of a training run and always on one batch."""
+    """A user's loop with a guard, built from the parts of a training run, always on one batch."""
 
     def __init__(self, recipe: Recipe, anchor: Path, out: Path, make: MakeGuard) -> None:
         self._run, self._batch = bench_runs.begun(recipe, anchor, out)
@@ -87,9 +87,9 @@ class _PlainLoop:
         self._mask, self._image = seen.mask, seen.image
 
     def forward(self) -> None:
-        """From no gradients to a loss."""
+        """Clear the gradients and compute a loss."""
         settings, policy, batch = self._run.recipe.train, self._run.policy, self._batch
-        # A plain backward leaves its watched pass unused, which the guard would refuse.
+        # A plain backward pass leaves the watched pass unused, which the guard would refuse.
         self._guard.discard()
         self._optimizer.zero_grad()
         with devices.autocast(policy.backbone.device, settings.precision):
@@ -105,7 +105,7 @@ class _PlainLoop:
         self._guard.backward(self._loss)
 
     def steps(self, count: int) -> None:
-        """`count` of the loop's steps."""
+        """Take `count` steps of the loop."""
         for _ in range(count):
             self.forward()
             self.backward()

@@ -1,4 +1,4 @@
-"""What `aegis bench` times: runs on random frames, step by step, in turn with each other."""
+"""What `aegis bench` times: steps of runs on random frames, alternating between runs."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from aegis_cli.training.assemble import TrainingRun
 
 INSTRUCTION = "move the finger to the red target"
 _ACTIONS, _PROPRIO, _FRAMES = 2, 6, 64  # A, P, and frames per episode
-NAIVE = "naive"  # what the others are measured against
+NAIVE = "naive"  # the reference for the others
 
 
 def recipes_by_method(
@@ -32,12 +32,12 @@ def recipes_by_method(
     """A recipe for each method in the order of tables, with its defaults unless overridden.
 
     Args:
-        chosen: methods; all where there are none. `naive` is always among them.
-        shared: what all have in common, as a recipe's file has it.
-        overrides: `key=value` of the recipe, as `--set` has them.
+        chosen: methods; empty: all. `naive` is always among them.
+        shared: what all have in common, as in a recipe's file.
+        overrides: `key=value` of the recipe, as for `--set`.
 
     Raises:
-        AegisError: a method or key that there is not, or a key that would make the methods one.
+        AegisError: an unknown method or key, or a key that would make the methods equal.
     """
     for name in chosen:
         methods.get(name)
@@ -63,9 +63,9 @@ def take_turns(
     on_event: OnEvent,
     before: Mapping[str, Callable[[], object]] = {},
 ) -> dict[str, float]:
-    """Median seconds of each part over `repeats` rounds, after one round that warms up.
+    """Median seconds of each part over `repeats` rounds, after one warm-up round.
 
-    What comes `before` a part is not timed.
+    What runs `before` a part is not timed.
     """
     times: dict[str, list[float]] = {name: [] for name in parts}
     for i in range(repeats + 1):
@@ -75,14 +75,14 @@ def take_turns(
                 wait()
             start = time.perf_counter()
             part()
-            wait()  # a GPU's kernels are only queued when the call returns
+            wait()  # when the call returns, a GPU's kernels are only queued
             times[name].append(time.perf_counter() - start)
         on_event(Progress(stage, i + 1, repeats + 1, "rounds"))
     return {name: statistics.median(taken[1:]) for name, taken in times.items()}
 
 
 def wait() -> None:
-    """Wait until the GPU has done what it was given."""
+    """Wait until the GPU has finished its queued work."""
     if devices.on_gpu():
         torch.cuda.synchronize()
 
@@ -94,19 +94,19 @@ def beside(
     rounds: int,
     on_event: OnEvent,
 ) -> tuple[float, dict[str, float]]:
-    """Seconds of one of the reference's steps, and the others' steps over it.
+    """Seconds of one of the reference's steps, and the ratio of the others' steps to it.
 
-    Each step of another is timed right beside one of the reference's. A machine's speed drifts by a
-    tenth within seconds, which would pass for a difference of two that are timed further apart.
+    Each step of another run is timed right next to one of the reference's. A machine's speed drifts
+    by a tenth within seconds, which would look like a difference if they were timed further apart.
 
     Args:
-        others: by name. In a round each takes whole turns, and no fewer steps than any has to, for
-            the fewer there are, the more their ratio varies.
+        others: by name. In a round each takes whole turns, and at least as many steps as the
+            longest turn has, since the ratio of fewer steps varies more.
 
     Returns:
-        Medians over `rounds` rounds, after one that warms up.
+        Medians over `rounds` rounds, after one warm-up round.
     """
-    # As many steps for all as the longest turn has, rounded up to whole turns of each.
+    # All take as many steps as the longest turn has, rounded up to whole turns of each.
     most = max(one.in_turn for one in others.values())
     ratios: dict[str, list[float]] = {name: [] for name in others}
     step_s: list[float] = []
@@ -124,10 +124,10 @@ def beside(
 
 
 def _alternating(first: Steps, second: Steps, count: int) -> tuple[float, float]:
-    """Seconds of so many steps of each of two, taken in the order a b, b a, a b and so on.
+    """Seconds of `count` steps of each of two runs, taken in the order a b, b a, a b and so on.
 
     So neither is always the first of a pair, and a steady drift cancels. On a GPU, whose clock is
-    steady, each takes all its steps in one go: to wait for every one is not what training does.
+    steady, each takes all its steps in one go, since training does not wait for each step.
     """
     at_once = count if devices.on_gpu() else 1
     both, taken_s = (first, second), [0.0, 0.0]
@@ -145,8 +145,8 @@ class Steps:
     """The steps of a training run, as `aegis train` takes them, all on one batch.
 
     Attributes:
-        in_turn: how many make a turn: as many as one constraint of the update covers and as share
-            an anchor gradient, so that every turn pays for one of each.
+        in_turn: number of steps in a turn: as many as share one constraint of the update and one
+            anchor gradient, so that every turn pays for one of each.
     """
 
     def __init__(self, run: TrainingRun, batch: RobotBatch) -> None:
@@ -155,7 +155,7 @@ class Steps:
         self.in_turn = math.lcm(run.parts.every, run.parts.refresh)
 
     def one(self) -> None:
-        """Take a step; the last of a turn reads the turn's figures."""
+        """Take a step; the last step of a turn reads the turn's figures."""
         train.update(self._run, self._taken, self._batch, self._window)
         self._taken += 1
         if self._taken % self.in_turn == 0:
@@ -173,7 +173,7 @@ def stepper(recipe: Recipe, anchor: Path, out: Path) -> Steps:
 
 
 def begun(recipe: Recipe, anchor: Path | None, out: Path) -> tuple[TrainingRun, RobotBatch]:
-    """A run before its first step, and a batch of noise for it, whatever the recipe names."""
+    """A run before its first step, and a batch of noise for it, whatever data the recipe names."""
     recipe = dataclasses.replace(unmoved(recipe), demos=Demos())
     run = assemble.build(
         recipe,
@@ -184,12 +184,12 @@ def begun(recipe: Recipe, anchor: Path | None, out: Path) -> tuple[TrainingRun, 
         ignore,
     )
     run.policy.train()
-    # Frames come again where a batch is larger than the episode: only their number costs.
+    # Frames repeat if a batch is larger than the episode: only their number affects the cost.
     rows = torch.arange(recipe.train.batch_size) % len(run.demos.train)
     frames, device = run.demos.train[rows], run.policy.backbone.device
     batch = run.demos.batch(frames, recipe.train.chunk)
     if devices.reading_stalls(device):
-        # Training has it ready on the GPU before its step begins.
+        # In training it is on the GPU before the step begins.
         batch = train.prepared(run, batch, frames, 0).with_prepared_on(device)
     return run, batch
 
@@ -197,7 +197,7 @@ def begun(recipe: Recipe, anchor: Path | None, out: Path) -> tuple[TrainingRun, 
 def unmoved(recipe: Recipe) -> Recipe:
     """The recipe with learning rates of 0, whose steps take the same time.
 
-    With those of a study, a variant that diverges would have no costs.
+    With a study's own rates, a variant that diverges would have no costs.
     """
     still = dataclasses.replace(recipe.train, backbone_lr=0.0, expert_lr=0.0)
     return dataclasses.replace(recipe, train=still)

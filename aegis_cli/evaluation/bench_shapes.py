@@ -1,10 +1,10 @@
-"""`aegis bench --shape`: what a step of each method, and each part of an anchor, cost at true size.
+"""`aegis bench --shape`: the cost of a step of each method and of each anchor part at true size.
 
-The model has random weights (models/backbones/shapes.py), and fits into memory once, so that
-everything is measured one after the other and nothing in turn. On a CPU each has a process of its
-own, for its peak of memory never falls; the seconds are those that its cores worked, which other
-work on the machine lengthens least. On a GPU one process measures all: what its tensors need is
-counted anew for each, and the seconds are of the clock on the wall.
+The model has random weights (models/backbones/shapes.py). It fits into memory only once, so
+measurements follow each other and do not alternate. On a CPU each has a process of its own, since
+a process's peak memory never falls; the seconds are CPU time, which other work on the machine
+affects least. On a GPU one process measures everything: the peak memory of its tensors is reset for
+each measurement, and the seconds are wall time.
 """
 
 from __future__ import annotations
@@ -34,33 +34,33 @@ from aegis_cli.models.backbones import shapes
 from aegis_cli.recipes import Recipe
 from aegis_cli.training.assemble import TrainingRun
 
-_BYTES = 4 * 4  # of a parameter that learns: weight, gradient and two moments in float32
-# Questions of an anchor's parts, and how many a pass takes; a part's time is given for each.
+_BYTES = 4 * 4  # per trainable parameter: weight, gradient and two moments in float32
+# Questions for an anchor's parts, and questions per pass; a part's time is per question.
 _SAMPLES, _AT_ONCE = 8, 2
 _SAMPLES_OF_GPU, _AT_ONCE_OF_GPU = 64, 8
-_KEPT = 256 * 2**20  # bytes that CUDA's libraries may keep on a GPU for themselves
+_KEPT = 256 * 2**20  # bytes that CUDA's libraries may keep allocated on a GPU
 _FIX = "free some memory, use a smaller --shape, or leave methods out with --methods"
 T = TypeVar("T")
 
 
 @dataclass(frozen=True)
 class StepCost:
-    """A method's training step at that shape; None throughout where it did not fit into memory.
+    """A method's training step at that shape; all None if it did not fit into memory.
 
     Attributes:
         step_s: seconds.
         step_time: seconds over naive's.
-        own_share: seconds a step that the method takes between the passes, for what it does to the
-            gradient and to the update, over naive's step. They are timed by themselves, and known
-            better than `step_time`, which is the ratio of two medians. None for a method that does
-            nothing there; what `aegis` does with two gradients is not in it.
-        peak_gb: 10^9 bytes that the process, or the GPU, needed at most.
-        peak_memory: that over naive's.
+        own_share: seconds per step that the method spends between the passes, on the gradient and
+            on the update, over naive's step. They are timed separately, and more precise than
+            `step_time`, which is the ratio of two medians. None for a method that does nothing
+            there; the work of `aegis` on two gradients is not included.
+        peak_gb: peak memory of the process, or of the GPU, in 10^9 bytes.
+        peak_memory: peak memory over naive's.
         tflop: 10^12 operations of its matrix products.
-        mfu: share of the device's peak that the operations which training needs make: at most
-            naive's, since a second backward pass is no use in itself. Under gradient checkpointing
-            the second forward pass counts, in naive's too. None where the device's peak is not
-            known.
+        mfu: the operations that training needs, as a share of the device's peak. At most naive's
+            operations count, since a second backward pass is no use in itself. Under gradient
+            checkpointing the second forward pass counts, for naive too. None if the device's peak
+            is not known.
     """
 
     step_s: float | None = None
@@ -77,8 +77,8 @@ class PartCost:
     """What a part of an anchor cost.
 
     Attributes:
-        question_s: seconds a question.
-        peak_gb: 10^9 bytes at most.
+        question_s: seconds per question.
+        peak_gb: peak memory in 10^9 bytes.
         megabytes: size of its file, in 10^6 bytes.
     """
 
@@ -92,13 +92,13 @@ class ShapeReport:
     """Costs at a true shape.
 
     Attributes:
-        parameters: of the backbone, in millions.
-        device: its name; clock: whose seconds are measured.
-        assumed: the peak that the MFU is a share of, and what it is of; None where it is not known.
-        tokens: that a frame with its instruction has in the language model.
+        parameters: the backbone's, in millions.
+        device: its name; clock: which kind of seconds is measured.
+        assumed: the peak that the MFU is relative to, and its device; None if it is not known.
+        tokens: number of tokens of a frame with its instruction in the language model.
         turns: how often a method's steps between two constraints were timed; the time is the
             median.
-        questions: that each part of the anchor was measured on.
+        questions: number of questions on which each part of the anchor was measured.
     """
 
     shape: str
@@ -122,7 +122,7 @@ class ShapeReport:
 
 @dataclass(frozen=True)
 class _Measured:
-    """What a process found."""
+    """What a process measured."""
 
     seconds: float
     peak: int
@@ -140,16 +140,16 @@ def run(
     overrides: Sequence[str] = (),
     on_event: OnEvent = ignore,
 ) -> ShapeReport:
-    """Measure each method's step at a shape, and the parts of an anchor that they read.
+    """Measure each method's step at a shape, and the parts of an anchor that the methods read.
 
     Args:
         shape: one of `shapes.SHAPES`.
-        chosen: methods; all where there are none. `naive` is always among them.
+        chosen: methods; empty: all. `naive` is always among them.
         turns: how often the steps between two constraints are timed.
-        overrides: `key=value` of the recipe, as `--set` has them.
+        overrides: `key=value` of the recipe, as for `--set`.
 
     Raises:
-        AegisError: a shape, method or key that there is not, or one that cannot fit.
+        AegisError: an unknown shape, method or key, or a shape that cannot fit into memory.
     """
     recipes_by_name = bench_runs.recipes_by_method(chosen, _shared(shape, batch_size), overrides)
     names = list(recipes_by_name)
@@ -159,7 +159,7 @@ def run(
     found: dict[str, _Measured | None] = {}  # methods, likewise
 
     def tell(name: str, last: _Measured | None) -> None:
-        """Say how far it is and what was measured last, which an interruption would lose."""
+        """Report the progress and the last measurement, which an interruption would lose."""
         done, total = len(measured) + len(found), len(parts) + len(names)
         figures = {} if last is None else {f"{name} s": last.seconds, "GB": last.peak / 1e9}
         on_event(Progress("bench shape", done, total, "processes", figures))
@@ -184,10 +184,10 @@ def _report(
     found: Mapping[str, _Measured | None],
     costs: dict[str, PartCost],
 ) -> ShapeReport:
-    """What was found, beside naive's.
+    """The costs, compared with naive's.
 
     Args:
-        used: naive's settings, which are all methods'.
+        used: naive's settings, which all methods share.
 
     Raises:
         AegisError: naive did not fit into memory.
@@ -228,7 +228,7 @@ def _shared(shape: str, batch_size: int) -> dict[str, Any]:
 
 
 def _check_fits(shape: shapes.Shape) -> None:
-    """Refuse a shape of which naive's step cannot fit, before anything is built."""
+    """Refuse a shape for which even naive's step cannot fit, before anything is built."""
     free, need = memory.free(devices.pick()), shape.parameters * 1e6 * _BYTES
     if free is not None and need > free:
         raise AegisError(
@@ -243,9 +243,9 @@ def _check_fits(shape: shapes.Shape) -> None:
 
 
 class _Processes:
-    """Where the work is done, within a `with` block: on a CPU in a process for each.
+    """Runs each measurement in a `with` block: on a CPU, each in a new process.
 
-    On a GPU one process goes on until its memory is full, or something is left there.
+    On a GPU one process is reused until its memory is full, or something stays allocated there.
     """
 
     def __init__(self) -> None:
@@ -259,7 +259,7 @@ class _Processes:
         self._open.__exit__(*error)
 
     def run(self, work: Callable[..., T], *arguments: Any) -> T | None:
-        """What `work` returns; None where a GPU had too little memory."""
+        """What `work` returns; None if a GPU had too little memory."""
         if self._pool is None:
             pool = WorkerPool(1, "a process of the benchmark", _FIX)
             self._pool = self._open.enter_context(pool)
@@ -271,7 +271,7 @@ class _Processes:
 
 
 def _unless_full(work: Callable[..., T], *arguments: Any) -> tuple[T | None, bool]:
-    """What `work` returns, or None; and whether this process may measure the next."""
+    """What `work` returns, or None if memory ran out; and whether this process can be reused."""
     try:
         memory.restart_peak(devices.pick())
         found = work(*arguments)
@@ -291,16 +291,16 @@ def _measure_part(backbone: str, part: str, out: Path) -> _Measured:
         samples=count, fisher_samples=count, batch_size=at_once, parts=(part,)
     )
     start = _now()
-    # Measured from its beginning, since its time is what counts.
+    # Saved progress is not used, since the time is measured.
     report = measure.run(backbone, settings, _anchor(out, [part]), keep=False)
     seconds = report.seconds[part] if devices.on_gpu() else _now() - start
     return _Measured(seconds, memory.peak(devices.pick()), megabytes=report.megabytes)
 
 
 def _measure_method(recipe: Recipe, out: Path, turns: int) -> _Measured:
-    """Measure a method's step: the time and peak of some turns after the first one.
+    """Measure a method's step: time and peak memory of some turns after the first one.
 
-    The operations are those of a turn after the peak: to count them takes memory as well.
+    Operations are counted in a later turn, after the peak is read, since counting takes memory too.
     """
     needs = methods.get(recipe.train.method).needs
     bench_runs.save_demos(out, recipe.task)
@@ -321,11 +321,11 @@ def _measure_method(recipe: Recipe, out: Path, turns: int) -> _Measured:
 
 
 def _own_seconds(run: TrainingRun, turn: Callable[[], None]) -> float | None:
-    """The seconds of one more turn that the method takes between the passes; None if none.
+    """Seconds that the method spends between the passes, in one more turn; None if none.
 
-    That is what it does to the gradient before the optimizer's step, and to the update after it,
-    copies of the weights included. On a GPU to time that is to wait, which is why other turns say
-    what a step takes.
+    This is its work on the gradient before the optimizer's step and on the update after it,
+    including copies of the weights. On a GPU timing it requires waiting, so the time of a whole
+    step comes from other turns.
     """
     parts, stepper = run.parts, run.stepper
     if not parts.constrains and parts.pull is None:
@@ -340,8 +340,8 @@ def _own_seconds(run: TrainingRun, turn: Callable[[], None]) -> float | None:
 
         return measured
 
-    # Where a training step calls the method: for the gradient, for the rates, and before and after
-    # the optimizer's step, where the weights are copied and the update is constrained.
+    # A training step calls the method for the gradient, for the rates, and before and after the
+    # optimizer's step, where the weights are copied and the update is constrained.
     run.parts = replace(
         parts,
         pull=parts.pull and timed(parts.pull),
@@ -353,7 +353,7 @@ def _own_seconds(run: TrainingRun, turn: Callable[[], None]) -> float | None:
 
 
 def _seconds(work: Callable[..., T], *arguments: Any) -> tuple[float, T]:
-    """How long the work takes, alone on the device, and what it returns."""
+    """How long the work takes if nothing else is queued on the device, and what it returns."""
     bench_runs.wait()
     start = _now()
     result = work(*arguments)
@@ -385,7 +385,7 @@ def _cost(found: _Measured | None, naive: _Measured, assumed: Peak | None) -> St
         return StepCost()
     mfu = None
     if assumed is not None:
-        # Operations that a step needs, of those that the device could have made meanwhile.
+        # Operations that a step needs, over those that the device could have done in that time.
         mfu = min(found.flop, naive.flop) / (found.seconds * assumed.tflops * 1e12)
     return StepCost(
         step_s=found.seconds,

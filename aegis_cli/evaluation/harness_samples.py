@@ -1,6 +1,6 @@
-"""What lmms-eval and lm-evaluation-harness note of each question.
+"""What lmms-eval and lm-evaluation-harness record for each question.
 
-They write a line of JSON for each where they are given `--log_samples --output_path FOLDER`.
+With `--log_samples --output_path FOLDER` they write one line of JSON per question.
 """
 
 from __future__ import annotations
@@ -29,18 +29,18 @@ _SAMPLES = (
     re.compile(r"samples_(?P<task>.+)_(?P<date>\d{4}-\d\d-\d\dT[\d.:-]+)\.jsonl"),
 )
 _RESULTS = ("{date}_results.json", "results_{date}.json")
-# Keys of a line that are no metric.
+# Keys of a line that are not metrics.
 _NO_METRIC = frozenset(
     "doc_id doc target arguments input input_media resps filtered_resps filter metrics "
     "token_counts doc_hash prompt_hash target_hash".split()
 )
-# Where a metric is an object, its key that says how the question was answered.
+# If a metric is an object, the keys that may say how the question was answered.
 _NOTED = ("score", "is_correct", "correct")
 WRITTEN = "what lmms-eval or lm-evaluation-harness writes with --log_samples --output_path FOLDER"
 
 
 def holds(place: Path) -> bool:
-    """Whether a folder has a file of samples, or a file is named as one."""
+    """Whether a folder has a file of samples, or a file is named like one."""
     return any(_named(path) is not None for path in _files(place))
 
 
@@ -60,7 +60,7 @@ def find(place: Path, on_event: OnEvent) -> Tasks:
 
 
 def _named(path: Path) -> tuple[str, str] | None:
-    """The task and the date that a file of samples is named after."""
+    """The task and the date in the name of a file of samples."""
     for shape in _SAMPLES:
         if (match := shape.fullmatch(path.name)) is not None:
             return match["task"], match["date"]
@@ -68,10 +68,10 @@ def _named(path: Path) -> tuple[str, str] | None:
 
 
 def read(task: str, paths: Mapping[str, Path], reading: Reading) -> QuestionLog:
-    """A task's lines, which are in one file.
+    """Read a task's lines, which are in one file.
 
     Raises:
-        AegisError: no line, a line that is no question's, or one question twice.
+        AegisError: no line, a line that is not a question's, or one question twice.
     """
     (path,) = paths.values()
     log = QuestionLog(path, falling=_falling(path))
@@ -88,7 +88,7 @@ def read(task: str, paths: Mapping[str, Path], reading: Reading) -> QuestionLog:
 
 
 def _check_lines(log: QuestionLog) -> None:
-    """Raise AegisError unless each question has as many lines, one for each filter of the task."""
+    """Raise AegisError unless all questions have equally many lines, one per filter of the task."""
     if len(set(log.lines.values())) > 1:
         (most, count), (least, fewer) = log.lines.most_common()[0], log.lines.most_common()[-1]
         raise AegisError(
@@ -109,7 +109,7 @@ def _add(log: QuestionLog, number: int, line: bytes) -> None:
     question = str(row["doc_id"])
     if "filter" not in row:
         log.lines[question] += 1
-    # lm-evaluation-harness has no text of the prompt, but its digest.
+    # lm-evaluation-harness records a digest of the prompt instead of its text.
     prompt = row.get("input", row.get("prompt_hash"))
     log.asked[question] = (prompt, row.get("target"))
     for name, value in _metrics(row, log.lines[question]):
@@ -120,11 +120,11 @@ def _add(log: QuestionLog, number: int, line: bytes) -> None:
 
 
 def _metrics(row: Mapping[str, Any], line: int) -> Iterator[tuple[str, float | None]]:
-    """The names of a line's metrics, with the filter that an answer went through, and values.
+    """The names of a line's metrics, including the answer's filter, and their values.
 
     Args:
-        line: which of the question's lines it is, from 1. lmms-eval names no filter, and writes a
-            line for each in the order that the task lists them in.
+        line: which of the question's lines it is, from 1. lmms-eval names no filters, and writes
+            one line per filter in the order in which the task lists them.
     """
     named = row.get("metrics")
     names = named if isinstance(named, list) else [key for key in row if key not in _NO_METRIC]
@@ -137,17 +137,17 @@ def _metrics(row: Mapping[str, Any], line: int) -> Iterator[tuple[str, float | N
 
 
 def _number(value: Any) -> float | None:
-    """A metric's value for one question, or what a task that sums up by itself has noted of it."""
+    """A metric's value for one question, or the value recorded by a task that aggregates itself."""
     if isinstance(value, dict):
         value = next((value[name] for name in _NOTED if name in value), None)
-    # A whole number may be too large for a float, and is no share then. NaN fails every comparison.
+    # An integer too large for a float cannot be a share. NaN fails every comparison.
     if not isinstance(value, int | float) or not abs(value) <= sys.float_info.max:
         return None
     return float(value)
 
 
 def _falling(path: Path) -> frozenset[str]:
-    """The metrics of a task of which less is better, as the file of results beside it says."""
+    """The metrics of a task for which lower is better, according to the results file beside it."""
     named = _named(path)
     assert named is not None  # no other file is read
     task, date = named
@@ -155,7 +155,7 @@ def _falling(path: Path) -> frozenset[str]:
         beside = path.with_name(shape.format(date=date))
         if beside.is_file():
             found = files.load_json(beside)
-            # {"higher_is_better": {TASK: {METRIC: true}}}, where it says so at all.
+            # {"higher_is_better": {TASK: {METRIC: true}}}, if it is there at all.
             for key in ("higher_is_better", task):
                 found = found.get(key) if isinstance(found, dict) else None
             rising = found if isinstance(found, dict) else {}

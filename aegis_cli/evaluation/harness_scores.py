@@ -1,8 +1,8 @@
 """`aegis scores`: what two models scored on the same benchmarks, question by question.
 
-lmms-eval, lm-evaluation-harness and VLMEvalKit note what a model got for each question. What one of
-them notes of a model before and after fine-tuning is of the same questions. So the difference is
-one of pairs, which is known far more closely than two averages apart.
+lmms-eval, lm-evaluation-harness and VLMEvalKit record a model's score for each question. A model
+before and after fine-tuning is asked the same questions, so the differences are paired, which gives
+a far narrower interval than two separate averages.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ class ScoreDrop:
 
     Attributes:
         task, metric: as the harness names them.
-        questions: that have the metric, in both models' files.
+        questions: number of questions that have the metric, in both models' files.
         before, after: means over these questions, in [0, 1].
-        drop_points: before less after, percentage points; drop_interval: its 95 % interval.
+        drop_points: before minus after, percentage points; drop_interval: its 95 % interval.
         passed: whether the gate lets the drop pass; None without a gate.
     """
 
@@ -52,14 +52,14 @@ class ScoreDrop:
 
 @dataclass(frozen=True)
 class ScoresReport:
-    """What was lost on every benchmark that both models were asked.
+    """What was lost on every benchmark on which both models were evaluated.
 
     Attributes:
         before, after: where the scores were read.
         scores: one for each metric of each task, in the tasks' alphabetical order.
-        left_out: tasks of which nothing was compared.
-        why_left_out: by each of these, the reason: only one of the two was asked, or none of their
-            metrics is a share for each question.
+        left_out: tasks for which nothing was compared.
+        why_left_out: the reason by task: only one of the two models was evaluated on it, or none of
+            its metrics is a share for each question.
         max_drop: points; None without a gate. gate: what of a drop it limits.
         passed: whether every score passes; None without a gate.
     """
@@ -87,16 +87,16 @@ def run(
     """Compare the scores of two models on the same questions.
 
     Args:
-        before, after: folders that the harness wrote, or single files of samples or tables. Of
-            several evaluations of a task in one folder the newest counts, and a warning says so.
-        max_drop: points that no score may drop by.
-        gate: what of a drop it limits: MEAN, the drop as measured, or UPPER, the upper end of its
+        before, after: folders that the harness wrote, or single files of samples or tables. If a
+            folder has several evaluations of a task, the newest counts, and a warning says so.
+        max_drop: the largest drop allowed for any score, in points.
+        gate: what the limit applies to: MEAN, the drop as measured, or UPPER, the upper end of its
             interval.
 
     Raises:
-        AegisError: no scores, those of two harnesses, no task or score in common, or questions that
-            differ; under a gate also a task of which only the first model has scores, or which was
-            judged otherwise.
+        AegisError: no scores, scores of two harnesses, no task or score in common, or questions
+            that differ; with a gate also a task for which only the first model has scores, or
+            which was judged differently.
     """
     if before.exists() and after.exists() and before.samefile(after):
         found = f"'{before}' before and after"
@@ -130,10 +130,10 @@ def run(
 
 
 def _harness(before: Path, after: Path) -> Harness:
-    """What measured both models.
+    """The harness that evaluated both models.
 
     Raises:
-        AegisError: nothing that is known, or two harnesses.
+        AegisError: no known harness, or two.
     """
     first, second = _harness_of(before), _harness_of(after)
     if first is not second:
@@ -176,7 +176,7 @@ def _nothing_known(place: Path) -> AegisError:
 
 
 def _lone(first: Tasks, second: Tasks, before: Path, after: Path) -> dict[str, str]:
-    """By task of which not both models have scores, the reason."""
+    """Tasks for which only one of the models has scores -> the reason."""
     why: dict[str, str] = {}
     for task in sorted(first.keys() | second.keys()):
         have = [place for own, place in ((first, before), (second, after)) if own.get(task)]
@@ -188,7 +188,7 @@ def _lone(first: Tasks, second: Tasks, before: Path, after: Path) -> dict[str, s
 
 
 def _refuse_unjudged(first: Tasks, second: Tasks, before: Path, after: Path) -> None:
-    """A gate would pass by an evaluation that had ended before it came to these tasks."""
+    """Raise AegisError for tasks that only the first model has scores for: a gate would pass."""
     tasks = sorted(task for task, own in first.items() if own and not second.get(task))
     if tasks:
         raise AegisError(
@@ -235,14 +235,14 @@ def _comparable(
 ) -> tuple[list[str], str]:
     """The metrics that both files have and that are a share for every question.
 
-    Others cannot be averaged, or have no points that a gate could limit; a warning says why each of
-    them is left out. Several that are equal for every question are one, and go by the first's name.
+    Other metrics cannot be averaged, or have no points that a gate could limit; a warning says why
+    each is left out. Metrics that are equal for every question count once, under the first name.
 
     Returns:
         The metrics, and why the others are left out.
 
     Raises:
-        AegisError: under a gate, there is none that both files have.
+        AegisError: there is a gate, and no metric that both files have.
     """
     before, after = logs
     shared = [name for name in before.values if name in after.values]
@@ -284,7 +284,7 @@ def _are_one(metric: str, other: str, logs: tuple[QuestionLog, QuestionLog]) -> 
 
 
 def _unfit(metric: str, logs: tuple[QuestionLog, QuestionLog]) -> str | None:
-    """Why a metric is no share in [0, 1] of which more is better; None if it is one."""
+    """Why a metric is not a share in [0, 1] for which higher is better; None if it is one."""
     values = [value for log in logs for value in log.values[metric].values()]
     numbers = [value for value in values if value is not None]
     if len(numbers) < len(values):
@@ -307,10 +307,10 @@ def _drop(
     """What was lost of one metric."""
     _check_same(task, metric, logs)
     before, after = (log.values[metric] for log in logs)
-    # In one order, so that the order of a file's rows does not change the sums.
+    # Sorted, so that the order of a file's rows does not change the sums.
     questions = sorted(before)
     values = np.array([[before[name], after[name]] for name in questions])  # [N, 2]
-    # Pairs: what a question's own difficulty adds is in both and goes out of the difference.
+    # Paired: a question's own difficulty affects both scores and cancels in the difference.
     losses = values[:, 0] - values[:, 1]
     low, high = mean_loss_interval(losses, _clusters(questions, logs[0].alike))
     drop, interval = 100 * float(losses.mean()), (100 * low, 100 * high)
@@ -333,9 +333,9 @@ def _drop(
 
 
 def _clusters(questions: Sequence[str], alike: Mapping[str, str]) -> list[int]:
-    """A number for each question, the same one for those that are not independent."""
+    """A cluster number for each question; questions that are not independent share one."""
     numbers: dict[tuple[str, str], int] = {}
-    # A question that shares nothing has its own number, whatever others call what they share.
+    # A question that shares nothing gets its own number, whatever names the others share.
     names = [("shared", alike[q]) if q in alike else ("own", q) for q in questions]
     return [numbers.setdefault(name, len(numbers)) for name in names]
 

@@ -1,7 +1,7 @@
-"""Answers that a model has given before, so that an interrupted probe goes on.
+"""Save a model's answers, so that an interrupted probe can resume.
 
-So does one of more questions, and a baseline is asked once. An answer is that of a model, a
-question and its image, and of the code, the libraries and the device that computed it.
+A probe with more questions reuses them too, and a baseline is asked only once. An answer is found
+by the model, the question and its image, and the code, libraries and device that computed it.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from aegis_cli.data.vqa.metrics import Graded, grade, graded_answer
 from aegis_cli.models import backbones
 from aegis_cli.models.backbones.base import Backbone
 
-Said = tuple[str, float]  # and its cross-entropy
+Said = tuple[str, float]  # an answer and its cross-entropy
 
 
 class Loaded(NamedTuple):
-    """A model, and a digest of all that its answers depend on in it.
+    """A model, and a digest of everything in it that its answers depend on.
 
-    The digest is None of random weights, and where somebody wrote to the files meanwhile: then
-    nobody knows which weights were loaded.
+    The digest is None for random weights, and if the files changed while they were read, since it
+    is then unknown which weights were loaded.
     """
 
     model: Backbone
@@ -41,35 +41,35 @@ class Loaded(NamedTuple):
 
 
 def load(name: str) -> Loaded:
-    """Load a backbone, as `backbones.load` does, and learn whose answers are its."""
+    """Load a backbone, as `backbones.load` does, and find the digest of its answers."""
     before = _places(name)
     model = backbones.load(name)
     if not before:
         return Loaded(model, None)
     home = next(iter(before)).parent
     weights = kept_digests.of_files(before, home)
-    if _places(name) != before:  # a training lets `last` lead to another folder, too
+    if _places(name) != before:  # a running training also makes `last` point to another folder
         return Loaded(model, None)
     content = [weights[path] for path in sorted(weights)]
     return Loaded(model, files.sha256_value({"weights": content, "settings": model.settings()}))
 
 
 def about(model: Backbone) -> dict[str, Any]:
-    """All that a model's answers depend on in it, as JSON; its weights are read for that."""
+    """Everything in a model that its answers depend on, as JSON; its weights are read for this."""
     return {"weights": model.fingerprint(), "settings": model.settings()}
 
 
 def of_now(model: Backbone) -> Loaded:
-    """A model as it is by now, maybe with weights of no file."""
+    """A model as it is now, possibly with weights that are in no file."""
     return Loaded(model, files.sha256_value(about(model)))
 
 
 def _places(name: str) -> dict[Path, object]:
-    """The files of a model, where they lie by now, as they are; none where it does not load."""
+    """The resolved paths of a model's files with their state; empty if it cannot be loaded."""
     try:
         paths = [Path(os.path.realpath(path)) for path in backbones.model_files(name)]
         return {path: kept_digests.stamp(path) for path in paths if path.is_file()}
-    except (AegisError, OSError):  # what is wrong, the load says better
+    except (AegisError, OSError):  # loading it gives the better error
         return {}
 
 
@@ -80,13 +80,13 @@ def ask(
     ranks: Ranks,
     on_event: OnEvent,
 ) -> list[Graded]:
-    """Every question's answer, graded; `models.asking.ask` of those that have none yet.
+    """Every question's graded answer; `models.asking.ask` is called for those without one.
 
-    Questions are asked in the batches that they would be asked in anyway, so that an answer is the
-    same bit for bit whether the work was interrupted or not. What is answered is kept at once.
+    The batches are those of an uninterrupted run, so an answer is the same bit for bit whether the
+    work was interrupted or not. Answers are saved at once.
 
     Args:
-        ranks: the processes that ask a part of the questions each.
+        ranks: the processes, each of which asks a share of the questions.
     """
     model = loaded.model
     own = asked.part(Share(ranks.rank, ranks.count).rows(len(asked.questions)))
@@ -106,7 +106,7 @@ def _asked(
 ) -> list[Graded]:
     keys = digests.of_questions(own)
     known = {line["question"]: _said(line) for line in kept.read() if _is_answer(line)}
-    rows: list[int] = []  # of the batches that are not answered whole
+    rows: list[int] = []  # of the batches that are not fully answered
     for first in range(0, len(keys), batch_size):
         batch = range(len(keys))[first : first + batch_size]
         if not all(keys[row] in known for row in batch):
@@ -131,7 +131,7 @@ def _asked(
 
 
 def _going_on(done: int, total: int, on_event: OnEvent) -> OnEvent:
-    """A listener to the rest of the questions, of which so many are answered."""
+    """A listener for the remaining questions, which adds the `done` answered ones to progress."""
 
     def told(event: Event) -> None:
         if isinstance(event, Progress):
@@ -149,7 +149,7 @@ def _line(question: str, said: str, cross_entropy: float) -> dict[str, object]:
 
 
 def _is_answer(line: Mapping[str, object]) -> bool:
-    """Whether a line is whole; others are measured again."""
+    """Whether a line is complete; other answers are computed again."""
     kinds = {"question": str, "said": str, "cross_entropy": float}
     return all(isinstance(line.get(name), kind) for name, kind in kinds.items())
 

@@ -1,7 +1,6 @@
-"""What the JSON files beside a run must hold, for those who read them back.
+"""What the JSON files beside a run must hold, for code that reads them back.
 
-Keys that are missing were not written by an older version, and keys that are not named here are
-read by nobody.
+Optional keys were not written by an older version. Keys that are not named here are never read.
 """
 
 from __future__ import annotations
@@ -79,7 +78,7 @@ class ProbeFigures:
 
 @dataclass(frozen=True)
 class PartFigures:
-    """Some of the episodes of a rollout, as those of one task of a set."""
+    """Some of the episodes of a rollout, such as those of one task of a set."""
 
     success: Number | None = None
     interval: Interval = None
@@ -88,7 +87,7 @@ class PartFigures:
 
 @dataclass(frozen=True)
 class RolloutSettings:
-    """What `aegis rollout` was asked for, as far as it tells rollouts apart."""
+    """The settings of `aegis rollout` that tell rollouts apart."""
 
     seed: int | None = None
     replan: int | None = None
@@ -169,7 +168,7 @@ class OpenLoopFigures:
 
 @dataclass(frozen=True)
 class TrainFigures:
-    """What a training of `aegis run` ended with."""
+    """The final figures of a training by `aegis run`."""
 
     method: str | None = None
     steps: int | None = None
@@ -186,7 +185,7 @@ class TrainFigures:
 
 @dataclass(frozen=True)
 class MergeFigures:
-    """How `aegis run` has merged what it trained."""
+    """How `aegis run` merged the model that it trained."""
 
     method: str
     strength: Number
@@ -196,21 +195,21 @@ class MergeFigures:
     validation_loss: Number | None = None
 
 
-Plain = dict[str, str | int | Number | bool | None]  # of a machine
+Plain = dict[str, str | int | Number | bool | None]  # facts about a machine
 
 
 def read(path: Path, kind: Any) -> dict[str, Any]:
-    """The JSON object of a file, as it lies there.
+    """The JSON object in a file, unchanged.
 
     Args:
-        kind: one of this module's.
+        kind: one of this module's types.
 
     Raises:
-        AegisError: a file that cannot be read, or something in it of another type.
+        AegisError: a file that cannot be read, or a value of another type.
     """
     raw = files.load_json(path)
     try:
-        # As JSON, where a strict check takes a list for a tuple, which JSON does not have.
+        # As JSON: a strict check then accepts a list for a tuple, which JSON does not have.
         _adapter(kind).validate_json(files.canonical(raw), strict=True)
     except ValidationError as error:
         first = error.errors()[0]

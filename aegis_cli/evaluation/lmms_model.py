@@ -1,9 +1,9 @@
 """The benchmarks of lmms-eval, such as MMMU and TextVQA, asked of a run's or a backbone's VLM.
 
-lmms-eval finds the model `aegis` by the entry point that pyproject.toml names, wherever both are
-installed: `lmms-eval --model aegis --model_args pretrained=runs/x --tasks textvqa_val`. Questions
-go the same way as those of `aegis probe`: the model's own processor, chat template and `generate`,
-in float32 unless another type is asked for.
+lmms-eval finds the model `aegis` by an entry point in pyproject.toml if both are installed:
+`lmms-eval --model aegis --model_args pretrained=runs/x --tasks textvqa_val`. Questions take the
+same path as those of `aegis probe`: the model's own processor, chat template and `generate`, in
+float32 unless another dtype is requested.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from aegis_cli.models import backbones
 from aegis_cli.models.backbones.base import FLOAT32, STORED_TYPES, Backbone
 
 NAME = "aegis"
-_MARK = "<image>"  # where a task's text says that an image stands
-_MOST = 1024  # tokens of an answer at most, where a task does not say
-_BETWEEN_SHOTS = "\n\n"  # what lmms-eval ends every answer at; no model of its own takes it
+_MARK = "<image>"  # marks the place of an image in a task's text
+_MOST = 1024  # tokens of an answer at most, unless a task says otherwise
+_BETWEEN_SHOTS = "\n\n"  # lmms-eval's default end of an answer, which its own models ignore
 
 
 def manifest() -> ModelManifest:
@@ -36,7 +36,7 @@ def manifest() -> ModelManifest:
 
 
 class _Asked(NamedTuple):
-    """One question: its place among the requests, its text, and what answers it."""
+    """One question: its index among the requests, its text, and settings for its answer."""
 
     place: int
     text: str
@@ -62,13 +62,13 @@ class AegisModel(lmms):
 
         Args:
             pretrained: a run, checkpoint, exported folder or backbone, as `aegis probe` takes it.
-            dtype: of the weights while they answer.
+            dtype: dtype of the weights during generation.
             batch_size: questions that are answered together.
-            device: as `--device` of Aegis; None: a GPU where there is one. Where accelerate or
-                torchrun has started several processes, each has its own GPU.
+            device: as `--device` of Aegis; None: a GPU if there is one. If accelerate or torchrun
+                has started several processes, each has its own GPU.
 
         Raises:
-            AegisError: nothing to load, or an argument that is none of these.
+            AegisError: nothing to load, or an unknown argument.
         """
         super().__init__()
         if unknown:
@@ -86,7 +86,7 @@ class AegisModel(lmms):
         """What the model answers to each request.
 
         Raises:
-            AegisError: a request for sampling, without an image, or about anything but images.
+            AegisError: a request that asks for sampling, has no image, or is not about images.
         """
         asked = [self._asked(place, request) for place, request in enumerate(requests)]
         answers = [""] * len(asked)
@@ -114,10 +114,10 @@ class AegisModel(lmms):
     def _batches(self, asked: Sequence[_Asked]) -> Iterator[list[_Asked]]:
         """Questions that may be answered together, the longest first.
 
-        A batch is as long as its longest question, and generates as many tokens as any of its
-        answers may have.
+        A batch is as long as its longest question, and generates as many tokens as its longest
+        answer may have.
         """
-        # Sorted by length, so that questions which are padded together are about as long.
+        # Sorted by length, so that questions of a batch need little padding.
         alike: dict[tuple[int, int], list[_Asked]] = {}
         for one in asked:
             alike.setdefault((one.most, len(one.images)), []).append(one)
@@ -137,11 +137,11 @@ class AegisModel(lmms):
             return self._backbone.answer(images, [one.text for one in batch], batch[0].most)
 
     def loglikelihood(self, requests: list[Instance]) -> list[tuple[float, bool]]:
-        """Refuse: what lmms-eval's tasks score, this model generates."""
+        """Refuse: this model only generates answers."""
         raise _not_of_this_kind(requests, "scores given answers")
 
     def generate_until_multi_round(self, requests: list[Instance]) -> list[str]:
-        """Refuse: a question has one answer here."""
+        """Refuse: this model answers each question once."""
         raise _not_of_this_kind(requests, "asks in several rounds")
 
 
@@ -158,7 +158,7 @@ def _whole(batch_size: int | str) -> int:
 
 
 def _round(backbone: Backbone, dtype: str) -> None:
-    """Keep a backbone's weights in this type."""
+    """Round a backbone's weights to this dtype."""
     if dtype not in STORED_TYPES:
         fix = f"--model_args pretrained=...,dtype={FLOAT32}"
         raise AegisError(f"dtype={dtype}", f"one of {', '.join(STORED_TYPES)}", fix)
@@ -170,10 +170,10 @@ def _round(backbone: Backbone, dtype: str) -> None:
 
 
 def _check_greedy(settings: Mapping[str, Any], task: str) -> None:
-    """Raise AegisError where a task wants answers that are drawn or searched for."""
+    """Raise AegisError if a task asks for sampling or beam search."""
     warm = bool(settings.get("temperature", 1))
     samples = settings.get("do_sample")
-    if samples is None:  # then models of lmms-eval go by the temperature
+    if samples is None:  # then lmms-eval's own models decide by the temperature
         samples = bool(settings.get("temperature"))
     if (samples and warm) or settings.get("num_beams") not in (1, None):
         wanted = {name: settings.get(name) for name in ("do_sample", "temperature", "num_beams")}
@@ -185,7 +185,7 @@ def _check_greedy(settings: Mapping[str, Any], task: str) -> None:
 
 
 def _check_images(shown: Sequence[Any], task: str, backbone: Backbone) -> None:
-    """Raise AegisError unless a question is about as many images as the backbone reads."""
+    """Raise AegisError unless the backbone can read the images of a question."""
     kinds = {type(one).__name__ for one in shown if not isinstance(one, Image)}
     if kinds:
         found = f"the task '{task}' asks about {', '.join(sorted(kinds))}"
@@ -199,7 +199,7 @@ def _check_images(shown: Sequence[Any], task: str, backbone: Backbone) -> None:
 
 
 def _until(text: str, ends: Sequence[str]) -> str:
-    """An answer up to the first of the texts that end it."""
+    """An answer up to the first stop text."""
     for end in ends:
         if end and end != _BETWEEN_SHOTS:
             text = text.split(end)[0]

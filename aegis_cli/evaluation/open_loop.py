@@ -1,7 +1,7 @@
 """`aegis evaluate`: predicted against recorded actions, on episodes that a run was not trained on.
 
-It is open loop: each prediction begins at a recorded frame, and nothing is executed. For a robot
-that is not simulated it is the figure there is. It does not say how often the robot succeeds.
+It is open loop: each prediction starts from a recorded frame, and nothing is executed. For a robot
+without a simulation it is the only figure available. It does not say how often the robot succeeds.
 """
 
 from __future__ import annotations
@@ -46,14 +46,14 @@ class DimensionError:
     """The error in one dimension of the actions, over all frames and steps of the chunks.
 
     Attributes:
-        unit: None where the data does not say.
-        mae, rmse: mean absolute error, and root of the mean squared error, in raw units.
-        training_std: standard deviation over the frames of the training, which is the RMSE there of
-            always predicting their mean; 0 where nothing varied.
-        constant_rmse: that of the best constant action on these frames, which is the standard
-            deviation of what was recorded.
-        hold_rmse: that of the current position, repeated; None where actions are no positions.
-        relative_error: squared error over the training's variance; None where nothing varied.
+        unit: None if the data does not say.
+        mae, rmse: mean absolute error and root mean squared error, in raw units.
+        training_std: standard deviation over the training frames, which is the RMSE there of always
+            predicting their mean; 0 if nothing varied.
+        constant_rmse: RMSE of the best constant action on these frames, which is the standard
+            deviation of the recorded actions.
+        hold_rmse: RMSE of repeating the current position; None if actions are not positions.
+        relative_error: squared error over the training variance; None if nothing varied.
         rmse_by_step: [H].
     """
 
@@ -70,9 +70,9 @@ class DimensionError:
 
 @dataclass(frozen=True)
 class StepError:
-    """The error so many steps ahead; step 1 is the action at the frame itself.
+    """The error a given number of steps ahead; step 1 is the action at the frame itself.
 
-    `frames` counts those whose episode lasts so long.
+    `frames` counts the frames whose episode lasts that long.
     """
 
     step: int
@@ -85,7 +85,7 @@ class StepError:
 class InstructionError:
     """The error at the frames of one instruction, over all dimensions and steps of their chunks.
 
-    `relative_interval` is by Student's t over the episodes; None of a single one.
+    `relative_interval` is by Student's t over the episodes; None for a single one.
     """
 
     instruction: str
@@ -100,7 +100,7 @@ class InstructionError:
 class EpisodeError:
     """The error in one episode, over all dimensions and steps of the chunks that begin in it.
 
-    `steps` counts those of all its chunks, of which the errors are means.
+    `steps` is the number of steps in all its chunks, over which the errors are averaged.
     """
 
     episode: int
@@ -112,7 +112,7 @@ class EpisodeError:
 
 @dataclass(frozen=True, eq=False)
 class Trace:
-    """An episode as a plot shows it; `predicted` [T, A] is new every `replan` frames."""
+    """An episode as a plot shows it; `predicted` [T, A] has a new chunk every `replan` frames."""
 
     episode: int
     replan: int
@@ -122,22 +122,22 @@ class Trace:
 
 @dataclass(frozen=True)
 class OpenLoopReport:
-    """How far predictions are from what was recorded.
+    """How far predictions are from the recorded actions.
 
     Attributes:
-        split: which episodes these are: the run's own `validation` episodes, all of `other data`
-            than it was trained on, those that were `chosen`, or all where it is `unknown` what the
-            policy was trained on.
-        trained_on: those of the episodes that the run was trained on; empty where that is not
-            known, as of an exported policy.
-        relative_error: mean squared error over the variance of the training's actions, mean over
-            the dimensions that varied there; 1 is the error of always predicting their mean.
+        split: which episodes these are: the run's own `validation` episodes, all episodes of `other
+            data` than the training's, `chosen` ones, or all if it is `unknown` what the policy was
+            trained on.
+        trained_on: the episodes among these that the run was trained on; empty if that is not
+            known, as for an exported policy.
+        relative_error: mean squared error over the variance of the training's actions, averaged
+            over the dimensions that varied there; 1 is the error of always predicting their mean.
         relative_interval: 95 % interval by Student's t over episodes; None for one episode.
-        hold_error: the same of repeating the current position, where actions are positions.
-        fps: steps of a chunk per second, which is the control rate of the demonstrations; None
-            where they do not say.
-        instructions: the same of each instruction that the frames have, the worst first.
-        episode_errors: the same of each episode, in the order of `episodes`.
+        hold_error: relative error of repeating the current position, if actions are positions.
+        fps: steps of a chunk per second, which is the control rate of the demonstrations; None if
+            they do not say.
+        instructions: the errors for each instruction of the frames, the worst first.
+        episode_errors: the errors for each episode, in the order of `episodes`.
         traces: what a plot shows; empty unless asked for.
     """
 
@@ -165,7 +165,7 @@ class OpenLoopReport:
         return found
 
     def kept(self) -> dict[str, Any]:
-        """What a run keeps of it: the error, by instruction and by episode."""
+        """The part of the report that a run keeps: the error, by instruction and by episode."""
         found = self.to_json()
         return {name: value for name, value in found.items() if name not in _BY_PART}
 
@@ -189,16 +189,16 @@ def run(
         run_path: the run of one policy, one of its checkpoints, an exported policy, or the id of a
             policy on the hub.
         data: demonstrations, a file or a LeRobot folder.
-        episodes: numbers from 0; None: the run's validation episodes where it was trained on this
+        episodes: numbers from 0; None: the run's validation episodes if it was trained on this
             data, else all.
-        frames: how many are predicted at, at most; they are spread evenly over the episodes.
-        seed: seeds the noise that the flow begins with.
+        frames: the largest number of frames to predict at, spread evenly over the episodes.
+        seed: seed of the noise from which the flow starts.
         batch_size: frames per forward pass.
-        traced: whether the report has what a plot shows.
-        keep: write the report into the run's folder, if it is that of a run or a checkpoint of it.
-        rename: what the policy calls cameras, features and joints of these demonstrations, besides
-            what the training renamed.
-        task: the policy's own, if any is named.
+        traced: whether the report includes the traces of a plot.
+        keep: write the report into the run's folder, if `run_path` is a run or its checkpoint.
+        rename: the policy's names for cameras, features and joints of these demonstrations, in
+            addition to the training's renaming.
+        task: if given, it must be the policy's own.
 
     Raises:
         AegisError: no such run, another task than its own, demonstrations that do not fit the
@@ -221,7 +221,7 @@ def run(
 
 
 class Asked(NamedTuple):
-    """What `aegis evaluate` is asked for beside the policy and the demonstrations: see `run`."""
+    """The settings of `aegis evaluate` besides the policy and the demonstrations: see `run`."""
 
     episodes: Sequence[int] | None = None
     frames: int = 1000
@@ -243,8 +243,8 @@ def evaluated(
     """Compare a policy's predictions with demonstrations, frame by frame.
 
     Args:
-        source: what is known of its training.
-        earlier: what it may have learned from besides.
+        source: what is known about its training.
+        earlier: other trainings that it may have learned from.
 
     Raises:
         AegisError: demonstrations that do not fit the policy, or episodes that cannot be told from
@@ -282,7 +282,7 @@ def evaluated(
 
 
 def _warn_of_standing_still(report: OpenLoopReport, on_event: OnEvent) -> None:
-    """Warn of a policy that is no nearer to what was done than a robot that stays where it is."""
+    """Warn about a policy that is no closer to the recording than a robot that stays in place."""
     error, hold = report.relative_error, report.hold_error
     if error is not None and hold is not None and error >= hold:
         text = (
@@ -296,7 +296,7 @@ def _warn_of_standing_still(report: OpenLoopReport, on_event: OnEvent) -> None:
 
 
 class _Chosen(NamedTuple):
-    """Episodes: how they are chosen, which they are, and which of them were trained on."""
+    """Episodes: how they were chosen, their numbers, and which of them were trained on."""
 
     split: str
     episodes: list[int]
@@ -304,7 +304,7 @@ class _Chosen(NamedTuple):
 
 
 def check_policy(run: Path) -> None:
-    """Raise AegisError for what is here and no policy; the hub is not asked for what is not."""
+    """Raise AegisError for an existing path that is not a policy, without asking the hub."""
     _refuse_stream(run)
     if (run.exists() or hub.is_local(str(run))) and not lerobot_folder.is_policy(run):
         checkpoint.chosen(run)
@@ -323,10 +323,10 @@ class Learned(NamedTuple):
     """What a training read of its demonstrations, and which of them it held out.
 
     Attributes:
-        read: of the recipe's section `demos` what `recipes.selected` tells.
-        camera: as the recipe has it.
-        share, seed: by which episodes were held out.
-        starts: the models that the training began with, as the recipe names them.
+        read: what `recipes.selected` returns for the recipe's section `demos`.
+        camera: as in the recipe.
+        share, seed: determine which episodes were held out.
+        starts: the models that the training started from, as the recipe names them.
     """
 
     read: dict[str, Any]
@@ -337,7 +337,7 @@ class Learned(NamedTuple):
 
     @classmethod
     def of(cls, recipe: recipes.Recipe) -> Learned:
-        """What the training of one policy has read and held out."""
+        """What the training of one policy read and held out."""
         demos, share = recipe.demos, recipe.train.validation_share
         starts = (recipe.expert.start, backbones.divided(recipe.backbone)[0])
         named = tuple(name for name in starts if name is not None)
@@ -345,10 +345,10 @@ class Learned(NamedTuple):
 
 
 class Earlier(NamedTuple):
-    """A training that a policy may owe something to besides its own.
+    """Another training that a policy may have learned from, besides its own.
 
     Attributes:
-        said: by whom or as what episodes were trained on, and what that means.
+        said: for a warning: what was trained on the episodes, and what follows for the policy.
     """
 
     said: str
@@ -358,14 +358,14 @@ class Earlier(NamedTuple):
 
 @dataclass(frozen=True)
 class Source:
-    """A policy, and what is known of its training.
+    """A policy, and what is known about its training.
 
     Outside a run `learned` is None; a folder in LeRobot's layout does not have the `digests` of the
     demonstrations either.
 
     Attributes:
-        words: what names the policy in a command, its folder first.
-        places: where the run found its demonstrations, as far as it says so.
+        words: the command-line words that name the policy, its folder first.
+        places: where the run found its demonstrations, if it says so.
     """
 
     words: tuple[str, ...]
@@ -375,10 +375,10 @@ class Source:
 
     @classmethod
     def find(cls, run: Path) -> tuple[Source, Path]:
-        """What is known of a run or policy, and the checkpoint to load.
+        """What is known about a run or policy, and the checkpoint to load.
 
         Raises:
-            AegisError: no such run, or that of a stream.
+            AegisError: no such run, or the run of a stream.
         """
         _refuse_stream(run)
         words, run = (str(run),), download.locate(run)
@@ -395,11 +395,11 @@ class Source:
 
     @property
     def name(self) -> str:
-        """What the policy is called in an error."""
+        """The policy's name in an error."""
         return self.words[0]
 
     def before(self) -> list[Earlier]:
-        """The trainings that this one began with, and theirs, as far as they are still whole."""
+        """The trainings that this one started from, recursively, as far as they still exist."""
         found = []
         for run in [] if self.learned is None else _began_with(self.learned):
             try:
@@ -412,13 +412,13 @@ class Source:
         return found
 
     def selection(self, meta: PolicyMeta, data: Path, rename: Renaming = ()) -> Selection:
-        """What training read of demonstrations like these, as far as it is known.
+        """What training would read of these demonstrations, as far as it is known.
 
         Args:
-            rename: names that the training did not meet.
+            rename: names that the training did not have.
 
         Raises:
-            AegisError: a folder of several cameras, and not those of the training.
+            AegisError: a folder with several cameras, but not those of the training.
         """
         own = ("only", "state", "action", "rename")
         known: dict[str, Any] = {name: meta[name] for name in own if name in meta}
@@ -433,7 +433,7 @@ class Source:
     def _camera(
         self, meta: PolicyMeta, data: Path, rename: Renaming
     ) -> str | tuple[str, ...] | None:
-        """The camera or cameras of a LeRobot folder that training saw; None: its only one."""
+        """The cameras of a LeRobot folder that training used; None: the folder's only one."""
         own = layout.read_info(data).cameras
         known = [renaming.feature(rename, name) for name in own]
         if self.learned is not None and self.learned.camera is not None:
@@ -457,10 +457,10 @@ class Source:
         """The episodes to predict on.
 
         Raises:
-            AegisError: some that are not there, or none that is known not to be trained on.
+            AegisError: episodes that do not exist, or none that is known to be held out.
         """
         count = demonstrations.count_episodes(data)
-        # Told apart by what the data holds, and not by where it lies.
+        # Compared by content and not by path.
         if not self.digests or not demonstrations.is_one_of(data, learned, self.digests):
             if asked is None and data.resolve() in self.places:
                 raise _has_changed(self.words, data, count)
@@ -477,7 +477,7 @@ class Source:
                 "demonstrations that it was not trained on",
             )
         share, seed = self.learned.share, self.learned.seed
-        # Drawn again as the training drew them: from the episodes that it learned from, by seed.
+        # Drawn again as the training drew them: by seed, from the episodes that it used.
         own = demonstrations.learned_from(data, count, self.learned.read.get("only"))
         held_out = own[demonstrations.held_out(len(own), share, seed)].tolist()
         if asked is None:
@@ -494,13 +494,13 @@ def _warn_of_earlier_learning(
     episodes: Sequence[int],
     on_event: OnEvent,
 ) -> None:
-    """Warn where the policy owes something to another training on some of these episodes."""
+    """Warn if the policy also learned from another training on some of these episodes."""
     for said, source, meta in earlier:
         try:
             learned = source.selection(meta, data, rename)
             known = source.choose(learned, data, episodes).trained_on
         except AegisError:
-            # These lack the cameras and features that it learned from.
+            # This data lacks the cameras or features that the other training used.
             continue
         if known:
             text = f"{len(known)} of these {len(episodes)} episodes were trained on {said}"
@@ -508,7 +508,7 @@ def _warn_of_earlier_learning(
 
 
 def _began_with(learned: Learned) -> list[Path]:
-    """The runs whose backbone or expert a training began with, and theirs, as far as still here."""
+    """The runs whose backbone or expert a training started from, recursively, if they exist."""
     found, waiting = list[Path](), [learned]
     while waiting:
         for name in waiting.pop().starts:
@@ -520,7 +520,7 @@ def _began_with(learned: Learned) -> list[Path]:
 
 
 def _run_here(path: Path) -> Path | None:
-    """The run of a policy that a folder is, or a checkpoint of; None of anything else."""
+    """The run of a policy to which a folder belongs: itself or its checkpoint; None otherwise."""
     if not path.is_dir() or recipes.is_stream_run(path):
         return None
     run = path if (path / "recipe.yaml").is_file() else checkpoint.run_of(path)
@@ -530,7 +530,7 @@ def _run_here(path: Path) -> Path | None:
 def _check_cameras(learned: str | tuple[str, ...], known: Sequence[str], data: Path) -> None:
     """Raise AegisError unless the cameras of the training are among those of the data."""
     named = (learned,) if isinstance(learned, str) else learned
-    # A recipe names a camera with or without LeRobot's prefix, and the policy has it with it.
+    # A recipe names a camera with or without LeRobot's prefix; a policy always uses the prefix.
     of_name = {name: camera for camera in known for name in (camera, layout.short(camera))}
     missing = [name for name in named if name not in of_name]
     if not missing:
@@ -548,7 +548,7 @@ def _check_cameras(learned: str | tuple[str, ...], known: Sequence[str], data: P
 
 
 def _has_changed(words: Sequence[str], data: Path, count: int) -> AegisError:
-    """The place is the training's, so most of its episodes may be those of the training."""
+    """The error for changed data at the training's path, most of which may have been trained on."""
     return AegisError(
         f"'{data}' is not as it was when '{words[0]}' learned from it: episodes were added, "
         f"removed or changed, and now there are {count}",
@@ -560,7 +560,7 @@ def _has_changed(words: Sequence[str], data: Path, count: int) -> AegisError:
 
 
 def _existing(asked: Sequence[int] | None, count: int, data: Path) -> list[int]:
-    """The episodes asked for, in order and once each; all of them for None."""
+    """The requested episodes, sorted and without duplicates; None: all of them."""
     if asked is None:
         return list(range(count))
     if beyond := [e for e in asked if not 0 <= e < count]:
@@ -575,7 +575,7 @@ def _existing(asked: Sequence[int] | None, count: int, data: Path) -> list[int]:
 def _check_robot(
     policy: Policy, meta: PolicyMeta, data: Path, learned: Selection, on_event: OnEvent
 ) -> None:
-    """Compare the robot with the policy's, before anything is decoded, which may take hours.
+    """Compare the robot with the policy's before decoding, which may take hours.
 
     Raises:
         AegisError: another robot, other cameras, or a joint in another place.
@@ -613,8 +613,8 @@ def _shown(
     chosen: _Chosen,
     on_event: OnEvent,
 ) -> Demonstrations:
-    """The demonstrations as the policy sees them; frames of the chosen episodes at least."""
-    # The frames of the episodes that were learned from may have been decoded by the training.
+    """The demonstrations as the policy sees them, with at least the chosen episodes' frames."""
+    # The training may already have decoded the frames of its episodes.
     is_own = chosen.split == VALIDATION
     only = learned.only if is_own else ",".join(map(str, chosen.episodes))
     selection, side = dataclasses.replace(learned, only=only), policy.backbone.image_size
@@ -625,10 +625,10 @@ def _shown(
 
 
 def _as_deployed(policy: Policy, shown: Demonstrations, meta: PolicyMeta) -> Demonstrations:
-    """The demonstrations, each camera's frames in the size in which a robot's are shown.
+    """The demonstrations, with each camera's frames in the size that a deployed policy sees.
 
-    A policy knows pictures of the sizes of its training; those of another camera are fitted to
-    them wherever it acts, and are here. They are as they are where the sizes are not known.
+    Where a policy acts, images of another camera are resized to the sizes of its training; the same
+    happens here. If those sizes are not known, frames are unchanged.
     """
     side = policy.backbone.image_size
     sizes = checkpoint.sizes_of(meta) if side is None else ((side, side),) * len(shown.frames)
@@ -636,10 +636,10 @@ def _as_deployed(policy: Policy, shown: Demonstrations, meta: PolicyMeta) -> Dem
 
 
 def _check_names(robot: Robot, meta: PolicyMeta, data: Path, on_event: OnEvent) -> None:
-    """Compare the joints' names with the policy's, where both have them; other names are warned of.
+    """Compare the joints' names with the policy's, if both have them; warn if they differ.
 
     Raises:
-        AegisError: a joint of the policy that has another place here.
+        AegisError: a joint of the policy that has another position here.
     """
     for other in joints.differences(meta, robot.names):
         known, found = ", ".join(other.known), ", ".join(other.found)
@@ -658,7 +658,7 @@ def _check_names(robot: Robot, meta: PolicyMeta, data: Path, on_event: OnEvent) 
 
 
 def _check_rate(robot: Robot, meta: PolicyMeta, data: Path, on_event: OnEvent) -> None:
-    """Warn of another control rate than the policy's, whose steps have another length."""
+    """Warn about a control rate that differs from the policy's, so that its steps differ too."""
     own = meta.get("fps")
     if own is not None and robot.fps is not None and own != robot.fps:
         text = (
@@ -685,7 +685,7 @@ def _traces(
     seed: int,
     batch_size: int,
 ) -> list[Trace]:
-    """What a plot shows, of the first episodes."""
+    """What a plot shows of the first episodes."""
     replan = min(meta["replan"], policy.expert.shape.chunk)
     first = chosen.episodes[:TRACED]
     return [_trace(policy, shown, episode, replan, seed, batch_size) for episode in first]
@@ -719,15 +719,15 @@ def compare(
     Steps past an episode's end do not count.
 
     Args:
-        training_std: [A], the standard deviations that errors are relative to; 0 of an action that
-            never varied there.
+        training_std: [A], the standard deviations that errors are relative to; 0 for an action that
+            never varied in training.
     """
     errors = ActionErrors.of(shown, at, predicted, training_std)
     relative, held, valid = errors.relative, errors.held, errors.valid
     return OpenLoopReport(
         data="",
         split=CHOSEN,
-        # Of a frame at least the first step is of its episode.
+        # At least the first step of each frame's chunk belongs to its episode.
         episodes=sorted(set(errors.episode_of.tolist())),
         trained_on=[],
         frames=len(at),
@@ -745,9 +745,10 @@ def compare(
 
 
 def _training_std(policy: Policy, meta: PolicyMeta, on_event: OnEvent) -> np.ndarray:
-    """As `training_std` has it; checkpoints of earlier versions may not tell it.
+    """The standard deviations of the training's actions, for `compare`.
 
-    They have their scale of relative actions or of quantiles in its place.
+    Checkpoints of earlier versions may lack them; their scale of relative actions or quantiles is
+    used instead.
     """
     other_scale = meta.get("relative") or meta.get("normalization", "mean_std") != "mean_std"
     if "action_std" not in meta and other_scale:
@@ -767,8 +768,8 @@ def _rmse(error: np.ndarray) -> float:
 def _dimensions(shown: Demonstrations, errors: ActionErrors) -> list[DimensionError]:
     hold, valid = errors.hold, errors.valid
     unit = None if shown.task is None else FULL_ACTION
-    # Padding is at a chunk's end. So the steps that any frame has are the first ones, and their
-    # places among these are their numbers.
+    # Padding is at a chunk's end, so the steps that any frame has are the first ones, and their
+    # index is their number.
     rows_of_step = [valid[:, h] for h in range(valid.shape[1]) if valid[:, h].any()]
     found = []
     for d, name in enumerate(action_names(shown)):
@@ -791,7 +792,7 @@ def _dimensions(shown: Demonstrations, errors: ActionErrors) -> list[DimensionEr
 
 
 def action_names(shown: Demonstrations) -> list[str]:
-    """A name for each dimension of the actions, its number where the data names none."""
+    """A name for each dimension of the actions; its number if the data has no names."""
     count, names = shown.tensors["actions"].shape[1], shown.action_names
     if len(names) != count:
         names = ("",) * count
@@ -801,7 +802,7 @@ def action_names(shown: Demonstrations) -> list[str]:
 def _horizon(
     relative: np.ndarray | None, held: np.ndarray | None, valid: np.ndarray
 ) -> list[StepError]:
-    """One entry per step ahead that an episode is long enough for."""
+    """One entry per step ahead for which some episode is long enough."""
     found = []
     for h in range(valid.shape[1]):
         rows = valid[:, h]
@@ -815,7 +816,7 @@ def _horizon(
 def _episodes(
     episode_of: np.ndarray, relative: np.ndarray | None, held: np.ndarray | None, valid: np.ndarray
 ) -> list[EpisodeError]:
-    """One entry per episode; a chunk counts for that in which it begins."""
+    """One entry per episode; a chunk counts for the episode in which it begins."""
     found = []
     for episode in np.unique(episode_of):
         rows = episode_of == episode
@@ -839,9 +840,9 @@ def _instructions(
     held: np.ndarray | None,
     valid: np.ndarray,
 ) -> list[InstructionError]:
-    """One entry per instruction, the worst first; a chunk counts for that of its first frame."""
+    """One entry per instruction, the worst first; a chunk counts for its first frame's."""
     rows_of: dict[str, list[int]] = {}
-    # A dataset may list one text as two tasks, so the text tells instructions apart.
+    # A dataset may list one text as two tasks, so instructions are compared by text.
     for row, number in enumerate(shown.instruction_of[at].tolist()):
         rows_of.setdefault(shown.instructions[number], []).append(row)
     found = []

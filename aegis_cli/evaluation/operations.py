@@ -1,4 +1,4 @@
-"""Counting the operations of matrix products, attention's among them."""
+"""Count the operations of matrix products, including those of attention."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ _KERNELS = ("flash_attention", "efficient_attention", "cudnn_attention", "flash_
 
 
 def counter() -> FlopCounterMode:
-    """Count, within its `with` block, what `get_total_flops` then returns.
+    """A context manager that counts operations; `get_total_flops` then returns them.
 
-    PyTorch counts no attention of a CPU. Before 2.13 it also refuses queries of more heads than
-    keys have.
+    PyTorch does not count attention on a CPU. Before 2.13 it also refuses queries with more heads
+    than the keys.
     """
     ours = {}
     for kernel in _KERNELS:
@@ -28,11 +28,11 @@ def counter() -> FlopCounterMode:
 
 
 def _attention(query: Size, key: Size, value: Size, *_: Any, **__: Any) -> int:
-    """Operations of the scores [B, H, T, S] and of the values' sum.
+    """Operations of the scores [B, H, T, S] and of the weighted sum of values.
 
     Args:
-        query: [B, H, T, D]; key: [B, h, S, D] of h heads, each for as many of the queries';
-        value: [B, h, S, E].
+        query: [B, H, T, D]; key: [B, h, S, D] with h heads, each shared by equally many query
+        heads; value: [B, h, S, E].
     """
     scores = math.prod(query[:3]) * key[2]  # B H T S
     # A multiplication and an addition for each of the D entries of a score, and the E of a value.
@@ -42,8 +42,8 @@ def _attention(query: Size, key: Size, value: Size, *_: Any, **__: Any) -> int:
 def _attention_backward(
     gradient: Size, query: Size, key: Size, value: Size, *_: Any, **__: Any
 ) -> int:
-    """Operations of its gradients: scores anew, and four products of their size."""
+    """Operations of its gradients: the recomputed scores and four products of their size."""
     scores = math.prod(query[:3]) * key[2]  # B H T S
-    # D each: the scores anew, the queries' and the keys' gradients. E each: the values' gradient
-    # and that of the weights.
+    # D each: the recomputed scores, and the gradients of queries and keys. E each: the gradients of
+    # values and weights.
     return 2 * scores * (3 * query[3] + 2 * value[3])

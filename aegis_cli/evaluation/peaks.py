@@ -1,4 +1,4 @@
-"""The peak of operations that a GPU can make."""
+"""The peak number of operations per second of a GPU."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Peak:
-    """The most operations that a device makes.
+    """The peak performance of a device.
 
     Attributes:
-        device: whose it is, by the maker's name.
-        tflops: 10^12 operations a second of dense matrix products.
-        dtype: of what type these are.
+        device: the maker's name of the device.
+        tflops: 10^12 operations per second of dense matrix products.
+        dtype: the dtype of these products.
     """
 
     device: str
@@ -21,8 +21,8 @@ class Peak:
     dtype: str
 
 
-# A part of the name that torch gives a GPU -> dense products in bfloat16 and in float32 (without
-# TF32, which Aegis does not use), by the makers' data sheets. The first that fits counts.
+# A part of torch's name for a GPU -> dense products in bfloat16 and in float32 (without TF32, which
+# Aegis does not use), from the makers' data sheets. The first match counts.
 _PEAKS = {
     "B200": (2250.0, 75.0),
     "GH200": (989.0, 67.0),
@@ -40,7 +40,7 @@ _PEAKS = {
 
 
 def peak_of(device: str, bf16: bool) -> Peak | None:
-    """The peak of a GPU of that name; None where it is not known."""
+    """The peak of a GPU of that name; None if it is not known."""
     for name, (half, single) in _PEAKS.items():
         if re.search(rf"\b{name}\b", device):
             return Peak(name, half if bf16 else single, "bfloat16" if bf16 else "float32")

@@ -1,4 +1,4 @@
-"""`aegis probe`: what the VLM still knows, on questions over images that nothing else has used."""
+"""`aegis probe`: what the VLM still knows, on questions about images that nothing else has used."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from aegis_cli.training import checkpoint
 from aegis_cli.training.folder import METRICS
 
 PROBE_SEED = 0
-W2_QUESTIONS = 1000  # moments of about 75,000 tokens; more change the third digit
+W2_QUESTIONS = 1000  # moments over about 75,000 tokens; more change only the third digit
 
 
 @dataclass(frozen=True)
@@ -47,8 +47,9 @@ class FamilyReport:
 class LayerW2:
     """Squared W2 distance between the anchor and the model's activations at one layer.
 
-    `baseline_w2` is the baseline's own on the same questions. It is not 0, for the anchor was
-    measured on others: what `w2` has beyond it is drift. None without a baseline.
+    `baseline_w2` is the baseline's own distance on the same questions. It is not 0, since the
+    anchor was measured on other questions; what `w2` exceeds it by is drift. None without a
+    baseline.
     """
 
     layer: str
@@ -63,10 +64,10 @@ class ProbeReport:
     Accuracy is in [0, 1] with its 95 % interval, cross-entropy in nats per answer, and the drop in
     percentage points.
 
-    The soft accuracy is of questions that people answered, so None for scenes; `skipped` counts bad
-    questions left out. `w2_between` names what the anchor was measured on, another question set or
-    robot frames, and the probe's questions, where these are two: then part of W2 is their own.
-    `asked` is what the command was to measure, and how.
+    The soft accuracy is for questions answered by people, so None for scenes; `skipped` counts bad
+    questions that were left out. If the anchor was not measured on the probe's question set,
+    `w2_between` names both: part of W2 is then due to that difference. `asked` holds the settings
+    of the command.
     """
 
     accuracy: float
@@ -110,18 +111,18 @@ def run(
 ) -> ProbeReport:
     """Ask `target` probe questions and, to measure the drop, `baseline` too.
 
-    Where torchrun has started several processes, each calls this, and they share the questions.
+    If torchrun has started several processes, each calls this, and they share the questions.
 
     Args:
-        questions: how many are asked; at most, where they come from files.
-        gate: what of the drop `max_drop` limits: MEAN, the drop as measured, or UPPER, the upper
-            end of its 95 % interval.
+        questions: number of questions; files may hold fewer.
+        gate: what `max_drop` limits: MEAN, the drop as measured, or UPPER, the upper end of its
+            95 % interval.
         predictions: also write every answer of `target` there, one line of JSON per answer.
-        skip_bad: leave bad questions of files out and count them.
+        skip_bad: leave out bad questions of files and count them.
         keep: write the report into the run's folder, if `target` is a run or one of its
             checkpoints.
-        ask: what a question becomes before a model reads it, with {} for it.
-        seed: of the choice of questions.
+        ask: template of the prompt, with {} for the question.
+        seed: seed of the choice of questions.
 
     Raises:
         AegisError: nothing to load, a bad question, or an anchor that does not belong to the
@@ -139,11 +140,11 @@ def run(
     if before is not None:
         _warn_of_another_start(target, baseline, before, on_event)
     measured = None if anchor is None else _anchor(anchor, model, before)
-    # Both models have to read every question: the drop is of the same ones.
+    # Both models have to read every question, since the drop compares the same questions.
     checks = [m.check_text for m in (model, before) if m is not None]
     asked = source.choose("probe", questions, seed, checks, on_event)
     with joined() as ranks:
-        # One model after the other: each is on the device only while it answers.
+        # The models take turns: each is on the device only while it answers.
         after, now = _answered(loaded, asked, measured, batch_size, ranks, on_event)
         reference, then = None, None
         if reference_model is not None:
@@ -171,7 +172,7 @@ def run(
         wrong = {"wrong": wrong_answers.examples(after, asked, model.image_size)}
         name = f"probe-{source.name}"
         figures = report.to_json() | wrong
-        del figures["asked"]  # the settings say it
+        del figures["asked"]  # the settings contain it
         settings |= _path_of(vqa)
         results.keep_if_possible(Path(target), name, figures, settings, on_event)
     return report
@@ -180,7 +181,7 @@ def run(
 def _check_predictions(
     predictions: Path, questions: Sequence[Path], models: Sequence[str], anchor: Path | None
 ) -> None:
-    """Raise AegisError unless `predictions` can be written and is no file that is read."""
+    """Raise AegisError unless `predictions` can be written and is not a file that is read."""
     files.check_writable(predictions)
     read = [*questions, *([] if anchor is None else [anchor])]
     for name in models:
@@ -188,13 +189,13 @@ def _check_predictions(
         run_folder = results.run_of(Path(name))
         if run_folder is not None:
             own = (path for path in run_folder.rglob("*") if path.is_file())
-            # An earlier probe's predictions may lie beside the run's own files.
+            # Predictions of an earlier probe may be among the run's own files.
             read += [path for path in own if path.suffix != ".jsonl" or path.name == METRICS]
     files.check_apart("--predictions", predictions, read)
 
 
 def _path_of(vqa: str) -> dict[str, str]:
-    """Where a question set of files lies, or its id on the hub; nothing of sets that ship."""
+    """The path of a question set, or its id on the hub; empty for built-in sets."""
     if vqa in (sets.SCENES, easy.NAME):
         return {}
     is_here = Path(vqa).parent.is_dir()
@@ -202,7 +203,7 @@ def _path_of(vqa: str) -> dict[str, str]:
 
 
 def _of_baseline(on_event: OnEvent) -> OnEvent:
-    """A listener that tells the baseline's answers from those of the model itself."""
+    """A listener that marks progress as the baseline's."""
     return lambda event: on_event(replace(event, stage=f"{event.stage} baseline"))
 
 
@@ -216,7 +217,7 @@ def _answered(
 ) -> tuple[list[Graded], list[float]]:
     """A model's graded answers, and its W2^2 per layer from an anchor, if there is one.
 
-    It is on the device meanwhile, and on the CPU again afterwards: two models may not fit.
+    The model is on the device only during this call, since two models may not fit.
     """
     model = loaded.model.to(devices.pick())
     graded = kept_answers.ask(loaded, asked, batch_size, ranks, on_event)
@@ -228,7 +229,7 @@ def _answered(
 def warn_of_little_knowledge(
     report: ProbeReport, model: str, ask: str, stage: str, on_event: OnEvent
 ) -> None:
-    """Warn where the questions were not answered before either; `ask` is how they were asked."""
+    """Warn if the model could not answer the questions before either; `ask` is the prompt."""
     before = report.accuracy if report.baseline_accuracy is None else report.baseline_accuracy
     knowledge.warn_if_little(before, report.majority, model, ask, stage, on_event)
 
@@ -241,18 +242,18 @@ def warn_of_few_questions(
     on_event: OnEvent,
     fix: str = "Ask more (--questions, probe.questions of a recipe, or a larger set)",
 ) -> None:
-    """Warn where the questions tell the drop less finely than its gate asks, and chance decides.
+    """Warn if there are too few questions to measure the drop as finely as its gate requires.
 
-    A drop that is far past the gate is settled by few. None of 0 points can be told by any number.
+    A drop far from the gate needs few questions. For a gate of 0 points no number is enough.
 
     Args:
-        fix: how more are asked.
+        fix: how to ask more questions.
     """
     if not max_drop or drop_interval is None:
         return
     low, high = drop_interval
     apart = (high - low) / 2
-    # Fine enough for the gate, or an interval that lies wholly on one side of it.
+    # Fine enough for the gate, or the interval lies entirely on one side of it.
     if apart <= max_drop or not low <= max_drop <= high:
         return
     text = (
@@ -266,11 +267,11 @@ def warn_of_few_questions(
 def _warn_of_another_start(
     target: str, baseline: str | None, before: Backbone, on_event: OnEvent
 ) -> None:
-    """Warn where a run is compared with a model that neither it nor a run before it began from."""
+    """Warn if a run is compared with a model that neither it nor a run before it started from."""
     folder = Path(target)
     if not folder.is_dir() or not (checkpoint.is_one(folder) or checkpoint.begun(folder)):
         return
-    # Only now: of billions of weights a digest takes as long as many answers.
+    # Done last: a digest of billions of weights takes as long as many answers.
     if before.fingerprint() not in _begun_from(folder):
         text = (
             f"--baseline {baseline} is not the model that '{target}' began from: the drop is a "
@@ -280,7 +281,7 @@ def _warn_of_another_start(
 
 
 def _begun_from(folder: Path) -> set[str | None]:
-    """Digests of the models that a run or a checkpoint began from, and the runs before it."""
+    """Digests of the models that a run or checkpoint started from, and the runs before it."""
     header = artifacts.read_header(checkpoint.chosen(folder) / checkpoint.EXPERT)
     run = results.run_of(folder)
     before = [] if run is None else results.origins(run)
@@ -288,10 +289,10 @@ def _begun_from(folder: Path) -> set[str | None]:
 
 
 class Answers(NamedTuple):
-    """What a model has answered, and its drift, empty where no anchor was given.
+    """A model's answers, and its drift, which is empty if no anchor was given.
 
     Attributes:
-        image_size: side in pixels of the images that the model was shown; None for their own.
+        image_size: side in pixels of the images that the model was shown; None: their own size.
     """
 
     graded: list[Graded]
@@ -308,10 +309,10 @@ def answers(
 ) -> Answers:
     """Ask a run or backbone, and measure its drift from an anchor.
 
-    Where torchrun has started several processes, each calls this, and they share the questions.
+    If torchrun has started several processes, each calls this, and they share the questions.
 
     Args:
-        anchor: its file, and the fingerprint of the backbone that it has to be of.
+        anchor: its file, and the fingerprint of the backbone that it must belong to.
 
     Raises:
         AegisError: nothing to load, or an anchor of another backbone.
@@ -326,9 +327,9 @@ def answers(
 
 
 def _anchor(path: Path, model: Backbone, before: Backbone | None) -> Anchor:
-    """The anchor, which has to be that of the pre-trained backbone.
+    """The anchor, which must be that of the pre-trained backbone.
 
-    One that was measured again on a trained backbone would hide the drift.
+    An anchor measured on a trained backbone would hide the drift.
     """
     owner = (model if before is None else before).fingerprint()
     try:
@@ -345,13 +346,12 @@ def _anchor(path: Path, model: Backbone, before: Backbone | None) -> Anchor:
 
 
 def two_sets(anchor: Path, asked: str, prompt: str = sets.PLAIN) -> str | None:
-    """What an anchor was measured on and the question set of a probe, if these are two.
+    """Names the data of an anchor and the question set of a probe, if they differ.
 
-    None stands for one and the same set that is asked in the same way, and for an anchor that names
-    none.
+    None if both are the same set with the same prompt, or if the anchor names no data.
 
     Args:
-        prompt: what a question of the probe becomes before a model reads it.
+        prompt: template of the probe's prompt, with {} for the question.
     """
     meta = artifacts.read_header(anchor).meta
     frames = meta.get("demos")
@@ -365,7 +365,7 @@ def two_sets(anchor: Path, asked: str, prompt: str = sets.PLAIN) -> str | None:
 
 
 def _warn_of_another_prompt(anchor: Path, asked: str, prompt: str, on_event: OnEvent) -> None:
-    """Warn of an anchor of the same questions that were asked in another way."""
+    """Warn about an anchor measured on the same questions with another prompt."""
     meta = artifacts.read_header(anchor).meta
     measured_as = meta.get("ask", sets.PLAIN)
     if meta.get("vqa") == asked and measured_as != prompt:
@@ -381,14 +381,13 @@ def drift(
 ) -> list[LayerW2]:
     """W2^2 per layer between the anchor and the model's activations on the first probe questions.
 
-    Image and text tokens are merged; text tokens alone are compared with an anchor that saw no
-    others.
+    Image and text tokens are merged; if the anchor saw only text tokens, only those are compared.
     """
     return _layers(_distances(model, asked, anchor, batch_size, ranks), None)
 
 
 def _layers(now: Sequence[float], then: Sequence[float] | None) -> list[LayerW2]:
-    """W2^2 of a model by layer, beside the baseline's."""
+    """W2^2 of a model by layer, with the baseline's."""
     baseline = [None] * len(now) if then is None else then
     pairs = zip(now, baseline, strict=True)
     return [LayerW2(f"layers.{i}", *both) for i, both in enumerate(pairs)]
@@ -397,14 +396,14 @@ def _layers(now: Sequence[float], then: Sequence[float] | None) -> list[LayerW2]
 def _distances(
     model: Backbone, asked: VQASet, anchor: Anchor, batch_size: int, ranks: Ranks
 ) -> list[float]:
-    # The first ones, so that every model of one probe is measured on the same.
+    # The first questions, so that all models of one probe are measured on the same ones.
     head = asked.sized(model.image_size).part(slice(W2_QUESTIONS))
     batches, count = head.batches(batch_size), len(head.questions)
     image, text = moments.measure(model, batches, count, ranks=ranks)
     found = []
     for layer in zip(image, text, anchor.image, anchor.text, strict=True):
         image_now, text_now, image_then, text_then = layer
-        if not image_then.count:  # the anchor is of prompts without images
+        if not image_then.count:  # the anchor's prompts had no images
             now, then = text_now, text_then
         else:
             now, then = merge(image_now, text_now), merge(image_then, text_then)
@@ -422,10 +421,10 @@ def compare(
     w2_between: str | None = None,
     gate: str = MEAN,
 ) -> ProbeReport:
-    """The report of two sets of answers to the same questions.
+    """The report on two sets of answers to the same questions.
 
     Raises:
-        AegisError: `max_drop` without answers from before.
+        AegisError: `max_drop` without the baseline's answers.
     """
     total, families = score(after), by_family(after)
     reference = None if before is None else score(before)
@@ -471,16 +470,16 @@ def compare(
 def by_image(
     after: Sequence[Graded], before: Sequence[Graded], names: Sequence[str] | None
 ) -> dict[str, Any]:
-    """What was lost on each image, which is what intervals over images are made of.
+    """What was lost on each image, from which intervals over images are computed.
 
-    `lost_per_image` is the number of correct answers before minus that after, of as many questions
-    as `questions_per_image` says; images are in the order of their numbers in the set.
+    `lost_per_image` is the number of correct answers before minus that after, out of
+    `questions_per_image`; images are in the order of their numbers in the set.
 
     Args:
-        names: of the set's images, which tell where another set has the same: `images`; None: no
-            other has.
+        names: names of the set's images, which identify equal images of other sets (`images`);
+            None: no other set shares them.
     """
-    # By image, whose questions share its difficulty: the crossed bootstrap draws whole images.
+    # By image, since its questions share its difficulty: the crossed bootstrap draws whole images.
     lost: dict[int, int] = {}
     questions: dict[int, int] = {}
     for now, then in zip(after, before, strict=True):
@@ -498,7 +497,7 @@ def check_trained(report: ProbeReport, steps: int) -> None:
     """Raise Diverged for a model that answers, but whose figures are not finite.
 
     Args:
-        steps: how many steps of training it had.
+        steps: number of its training steps.
     """
     figures = {
         "cross-entropy": report.cross_entropy,

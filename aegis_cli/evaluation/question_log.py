@@ -1,4 +1,4 @@
-"""What a benchmark harness noted of each question: what its readers give, whatever it is called."""
+"""What a benchmark harness recorded for each question, in one form for all harnesses."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ from typing import Any
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Progress, Warned
 
-_TOLD_BYTES = 1_000_000  # between two tellings of how much is read
+_TOLD_BYTES = 1_000_000  # bytes read between two progress events
 
-# By task, the files that hold its scores, by what tells them apart. A task without a file was
-# asked, and what each question got was not noted.
+# Task -> its files of scores, by a name that tells them apart. A task without a file was evaluated,
+# but no scores per question were recorded.
 Tasks = Mapping[str, Mapping[str, Path]]
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """One time that a model was asked a task.
+    """One evaluation of a model on a task.
 
     Attributes:
-        date: a text, of which the newest is the last one.
-        folder: the model's.
-        name: what a user knows this evaluation by.
-        files: those with its scores, by what tells them apart.
+        date: a text that sorts by time.
+        folder: the model's folder.
+        name: the evaluation's name for a user.
+        files: its files of scores, by a name that tells them apart.
     """
 
     date: str
@@ -36,10 +36,10 @@ class Evaluation:
 
 
 def newest(place: Path, found: Mapping[str, Sequence[Evaluation]], on_event: OnEvent) -> Tasks:
-    """The files of each task's newest evaluation; a warning tells of older ones.
+    """The files of each task's newest evaluation; a warning mentions older ones.
 
     Raises:
-        AegisError: a task's evaluations are in several folders, and so of several models.
+        AegisError: a task's evaluations are in several folders, so they belong to several models.
     """
     tasks: dict[str, Mapping[str, Path]] = {}
     for task, own in found.items():
@@ -64,13 +64,13 @@ class QuestionLog:
 
     Attributes:
         path: the first file that they were read from.
-        asked: by the question's number, what was asked, and the reference answer.
-        values: by metric and question, the number that the harness gave; None where it is none.
-        lines: by the question's number, how many lines without a filter's name it has.
-        falling: metrics of which less is better.
-        alike: by the question's number, what others share with it that are not independent of it,
-            such as its image; questions that are not in it are independent.
-        doubts: by why their scores tell nothing of the model, the numbers of questions.
+        asked: question number -> what was asked, and the reference answer.
+        values: metric and question -> the harness's value; None if it is not a number.
+        lines: question number -> how many lines without a filter's name it has.
+        falling: metrics for which lower is better.
+        alike: question number -> what it shares with questions that depend on it, such as its
+            image; questions that are not in it are independent.
+        doubts: reason why scores say nothing about the model -> numbers of these questions.
     """
 
     path: Path
@@ -83,14 +83,14 @@ class QuestionLog:
 
 
 class Reading:
-    """Tells how much of all files is read; those of a benchmark may have gigabytes."""
+    """Reports how much of all files has been read; a benchmark's may have gigabytes."""
 
     def __init__(self, paths: Sequence[Path], on_event: OnEvent) -> None:
         self._total = sum(path.stat().st_size for path in paths)
         self._done, self._told, self._on_event = 0, 0, on_event
 
     def read(self, size: int) -> None:
-        """So many bytes more."""
+        """Count `size` more bytes."""
         self._done += size
         if self._done - self._told >= _TOLD_BYTES or self._done == self._total:
             self._told = self._done
@@ -99,13 +99,13 @@ class Reading:
 
 @dataclass(frozen=True)
 class Harness:
-    """What reads one harness's files.
+    """A reader of one harness's files.
 
     Attributes:
-        name: the harness's.
+        name: the harness's name.
         holds: whether a folder has files of this harness, or a file is one.
-        find: the files of each task, of one model, of the newest evaluation.
-        read: a task's files.
+        find: finds the files of each task's newest evaluation of one model.
+        read: reads a task's files.
     """
 
     name: str

@@ -1,8 +1,8 @@
-"""What probes, rollouts and open-loop evaluations have measured of a run, kept in its folder.
+"""Results of probes, rollouts and open-loop evaluations of a run, kept in its folder.
 
 `aegis run` writes probe.json and rollout-*.json beside the checkpoints, and knows by their digests
-what is up to date. What `aegis probe`, `aegis rollout` and `aegis evaluate` measure lies apart, in
-`results`.
+what is up to date. Results of `aegis probe`, `aegis rollout` and `aegis evaluate` are in a separate
+folder, `results`.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ from aegis_cli.models import backbones
 from aegis_cli.training import checkpoint, folder, inputs, track
 
 FOLDER = "results"
-OPEN_LOOP = "evaluate"  # what the names of its files begin with
-# Which episodes an open-loop evaluation is of.
+OPEN_LOOP = "evaluate"  # prefix of its files' names
+# Which episodes an open-loop evaluation used.
 VALIDATION, OTHER, CHOSEN, UNKNOWN = "validation", "other data", "chosen", "unknown"
-_PATIENCE_S = 5.0  # with others who write there
-# What one probe of a checkpoint tells and another of the same questions may not.
+_PATIENCE_S = 5.0  # for other processes that write there
+# Figures that one probe of a checkpoint has and another of the same questions may lack.
 _TOLD = {"drop_points": "drop", "passed": "gate", "layers": "drift"}
 
 
@@ -46,18 +46,18 @@ def keep(
 ) -> Path | None:
     """Write a measurement of a run, or of one of its checkpoints, into the run's folder.
 
-    A later one of the same name replaces it, if it is of the same question set or demonstrations:
-    two of them may be files of one name in different folders. A probe that tells less than an
-    earlier one, such as no drop, is kept beside it, and `on_event` hears of that.
+    A later one with the same name replaces it if both used the same question set or demonstrations;
+    files in different folders may have the same name. A probe with fewer figures than an earlier
+    one, such as no drop, is kept beside it, and `on_event` receives a message about that.
 
     Args:
         name: `probe-scenes`, `rollout-seen` or `evaluate-validation-arm`.
         figures: what was measured, as `--json` shows it.
-        settings: what was asked for, written beside the figures; `path` is that of the question
-            set or the demonstrations, where they are a file or a folder.
+        settings: what was requested, written with the figures; `path` is that of the question set
+            or the demonstrations, if they are a file or a folder.
 
     Returns:
-        The file; None where `target` is no run of one policy, or may not be written to.
+        The file; None if `target` is not a run of one policy, or may not be written to.
 
     Raises:
         AegisError: another process writes there for longer than some seconds, or the disk is full.
@@ -67,9 +67,9 @@ def keep(
         return None
     run, step = found
     figures, settings = _in_utf8(figures), _in_utf8(settings)
-    # A file's name or a data set's path may hold anything.
+    # A file's name or a dataset's path may contain any character.
     plain = re.sub(r"[^\w.-]+", "_", name).strip("_.")
-    # What is measured of the last checkpoint has the plain name, of an earlier one its step too.
+    # Results of the last checkpoint have the plain name; those of an earlier one add its step.
     of_last = step == _last_step(run)
     with _soon_alone(run / FOLDER):
         path = run / FOLDER / (f"{plain}.json" if of_last else f"{plain}-{step:06d}.json")
@@ -92,7 +92,7 @@ def keep_if_possible(
     settings: Mapping[str, Any],
     on_event: OnEvent,
 ) -> None:
-    """The same; where it cannot be written, a warning says so, for the figures are known by now."""
+    """Like `keep`, but if writing fails, warn instead, so that the figures are not lost."""
     try:
         keep(target, name, figures, settings, on_event)
     except AegisError as problem:
@@ -101,7 +101,7 @@ def keep_if_possible(
 
 
 def _in_utf8(value: Any) -> Any:
-    """A measurement whose texts can be read back: bytes of a path that are no UTF-8 written out."""
+    """A measurement as valid UTF-8: bytes of a path that are not UTF-8 are escaped."""
     if isinstance(value, str):
         return value.encode("utf-8", "backslashreplace").decode()
     if isinstance(value, Mapping):
@@ -111,10 +111,10 @@ def _in_utf8(value: Any) -> Any:
 
 @contextlib.contextmanager
 def _soon_alone(place: Path) -> Generator[None]:
-    """Be the only process that writes there, after some seconds at most: others do not take long.
+    """Be the only process that writes there, waiting some seconds at most for others to finish.
 
     Raises:
-        AegisError: somebody is still at it.
+        AegisError: another process is still writing.
     """
     until = time.monotonic() + _PATIENCE_S
     with contextlib.ExitStack() as held:
@@ -123,7 +123,7 @@ def _soon_alone(place: Path) -> Generator[None]:
                 held.enter_context(locks.alone(place))
                 break
             except AegisError:
-                # It may be gone by now: who leaves an empty folder removes it.
+                # The folder may be gone by now: a process that leaves it empty removes it.
                 if time.monotonic() > until:
                     raise
                 time.sleep(0.1)
@@ -131,7 +131,7 @@ def _soon_alone(place: Path) -> Generator[None]:
 
 
 def _is_of_other_data(path: Path, settings: Mapping[str, Any]) -> bool:
-    """Whether a file has what was measured on questions or demonstrations that lie elsewhere."""
+    """Whether a file's results are for questions or demonstrations at another path."""
     if "path" not in settings or not path.is_file():
         return False
     found = files.load_json(path)
@@ -142,13 +142,13 @@ def _is_of_other_data(path: Path, settings: Mapping[str, Any]) -> bool:
 def _beside_what_tells_more(
     path: Path, figures: Mapping[str, Any], step: int | None, on_event: OnEvent
 ) -> Path:
-    """Where a probe is kept: beside an earlier one that tells what it does not, else in its place.
+    """Where to keep a probe: beside an earlier one with figures that it lacks, else in its place.
 
-    Those beside it that tell no more than the new one are removed, as if they had been replaced.
+    Earlier ones that have no more figures than the new one are removed, as if replaced.
     """
     told = _told(figures)
-    # A name for each choice of what a probe may tell, such as PROBE-with-drop-gate. One that tells
-    # all of it has the plain name, so that the choices here are of fewer words.
+    # A name for each subset of the optional figures, such as PROBE-with-drop-gate. A probe with all
+    # of them has the plain name, so only smaller subsets are listed here.
     by_told: dict[Path, set[str]] = {}
     for size in range(len(_TOLD)):
         for some in itertools.combinations(_TOLD.values(), size):
@@ -170,27 +170,27 @@ def _beside_what_tells_more(
 
 
 def _told(figures: Mapping[str, Any]) -> set[str]:
-    """The words of `_TOLD` for what a probe tells."""
+    """The words of `_TOLD` for the figures that a probe has."""
     return {word for key, word in _TOLD.items() if figures.get(key) not in (None, [])}
 
 
 def run_of(target: Path) -> Path | None:
-    """The run of one policy that a folder is, or has as a checkpoint; None of others."""
+    """The run of one policy to which a folder belongs: itself or its checkpoint; else None."""
     found = _run_and_step(target)
     return None if found is None else found[0]
 
 
 def recipe_of(run: Path) -> recipes.Recipe:
-    """The recipe that a run of one policy was trained by."""
+    """The recipe with which a run of one policy was trained."""
     return recipes.load(run / "recipe.yaml")
 
 
 class Origin(NamedTuple):
-    """A model that a run began from.
+    """A model that a run started from.
 
     Attributes:
-        name: as a recipe has it.
-        digest: of its weights; None where the run has no checkpoint that tells.
+        name: as in a recipe.
+        digest: digest of its weights; None if no checkpoint of the run records it.
     """
 
     name: str
@@ -198,9 +198,9 @@ class Origin(NamedTuple):
 
 
 def origins(run: Path) -> list[Origin]:
-    """The models that a run began from: its own backbone, and that one's own where it is a run.
+    """The models that a run started from: its backbone, and if that is a run, its backbone too.
 
-    The last of them is the VLM that nothing of ours has trained.
+    The last one is the VLM that no run of Aegis has trained.
     """
     found: list[Origin] = []
     seen: set[Path] = set()
@@ -211,16 +211,16 @@ def origins(run: Path) -> list[Origin]:
         digest = None if header is None else header.inputs.get("backbone")
         found.append(Origin(recipe_of(run).backbone, digest))
         before = run_of(Path(backbones.divided(found[-1].name)[0]))
-        # One that has been put in the place of its own backbone begins from itself.
+        # A run that was moved to the path of its own backbone would start from itself.
         if before is None or before.resolve() in seen:
             return found
         run = before
 
 
 def _run_and_step(target: Path) -> tuple[Path, int | None] | None:
-    """The run that a path belongs to, and the step of what is measured; None of others.
+    """The run that a path belongs to, and the step of its weights; None for other paths.
 
-    The step of a run is None where it has no checkpoint.
+    The step of a run is None if it has no checkpoint.
     """
     if (target / "recipe.yaml").is_file():
         return None if recipes.is_stream_run(target) else (target, _last_step(target))
@@ -230,7 +230,7 @@ def _run_and_step(target: Path) -> tuple[Path, int | None] | None:
 
 
 def _last_step(run: Path) -> int | None:
-    """After how many steps the last checkpoint was written; None where a study has removed it."""
+    """The step of the last checkpoint; None if a study has removed it."""
     link = run / "checkpoints" / checkpoint.LAST
     return checkpoint.step_of(link) if link.is_dir() else None
 
@@ -240,9 +240,9 @@ class Result:
     """One measurement of a run.
 
     Attributes:
-        name: of its file, without the ending.
+        name: its file's name without the suffix.
         figures: as `--json` shows them.
-        settings: what was asked for; empty where `aegis run` did, by the run's recipe.
+        settings: what was requested; empty if `aegis run` measured it by the run's recipe.
     """
 
     name: str
@@ -254,10 +254,10 @@ class Result:
 class Played:
     """How a rollout was played: the seed of its episodes, and how the policy's chunks were used.
 
-    Where it was by the run's recipe, that says it.
+    For a rollout by the run's recipe, these values come from the recipe.
 
     Attributes:
-        delay, guided: as `aegis rollout` was asked; None without a delay.
+        delay, guided: as given to `aegis rollout`; None without a delay.
     """
 
     seed: int
@@ -275,22 +275,22 @@ class PlayedResult(Result):
 
 
 def probes(run: Path) -> list[Result]:
-    """The probes of a run's last checkpoint; that of `aegis run` comes first.
+    """The probes of a run's last checkpoint; those of `aegis run` come first.
 
-    One that asked the same again and found the same is told with it, as one.
+    A later probe with the same questions and results is merged into the first one.
     """
     recipe, each = recipe_of(run), list[Result]()
     for _, found in _read(run, "probe", ProbeFigures):
         by_recipe = [i for i, first in enumerate(each) if not first.settings]
         again = [i for i in by_recipe if _is_again(found, each[i], recipe)]
-        for i in again[:1]:  # it may know more, such as the baseline's drift
+        for i in again[:1]:  # it may have more figures, such as the baseline's drift
             each[i] = dataclasses.replace(each[i], figures={**each[i].figures, **found.figures})
         each += [] if again else [found]
     return each
 
 
 def _is_again(found: Result, first: Result, recipe: recipes.Recipe) -> bool:
-    """Whether a probe asked what `first` did, which is by the recipe, and found the same."""
+    """Whether a probe had the questions and results of `first`, a probe by the recipe."""
     limits = {"max_drop": recipe.probe.max_drop, "gate": recipe.probe.gate}
     if question_set(found, recipe) != question_set(first, recipe):
         return False
@@ -304,7 +304,7 @@ def _is_again(found: Result, first: Result, recipe: recipes.Recipe) -> bool:
 
 
 def _without_baseline(figures: Mapping[str, Any]) -> dict[str, Any]:
-    """A probe's figures, less the drift of the model before training, which `aegis run` leaves."""
+    """A probe's figures without the baseline's drift, which `aegis run` does not measure."""
     layers = [{**layer, "baseline_w2": None} for layer in figures.get("layers") or []]
     return {**figures, "layers": layers}
 
@@ -312,8 +312,8 @@ def _without_baseline(figures: Mapping[str, Any]) -> dict[str, Any]:
 def rollouts(run: Path) -> list[PlayedResult]:
     """The rollouts of a run's last checkpoint; those of `aegis run` come first.
 
-    Held-out colours come after those of training. Of those that played the same episodes in the
-    same way, the newest stands for all.
+    Held-out colours come after those of training. If several played the same episodes in the same
+    way, only the newest is listed.
     """
     recipe = recipe_of(run)
     newest = dict[tuple[Any, ...], tuple[int, PlayedResult]]()
@@ -329,7 +329,7 @@ def rollouts(run: Path) -> list[PlayedResult]:
 
 
 def _played(found: Result, recipe: recipes.Recipe) -> Played:
-    """How a rollout was played; earlier versions did not write all of it down."""
+    """How a rollout was played; earlier versions did not record all of it."""
     said, own = found.settings, recipe.rollout
     if not said:
         return Played(own.seed, own.replan, own.ensemble)
@@ -339,13 +339,13 @@ def _played(found: Result, recipe: recipes.Recipe) -> Played:
 
 
 def told_apart(played: Sequence[Played]) -> list[str]:
-    """In words how each rollout was played, as far as others beside it were played otherwise."""
+    """Describes each rollout by the settings in which the given rollouts differ."""
     names = [field.name for field in dataclasses.fields(Played)]
     differ = [name for name in names if len({getattr(one, name) for one in played}) > 1]
     found = []
     for one in played:
         words = [_said(name, getattr(one, name)) for name in differ]
-        found.append(", ".join(filter(None, words)))  # what is not guided has no word for it
+        found.append(", ".join(filter(None, words)))  # an unguided rollout has no word for this
     return found
 
 
@@ -356,13 +356,13 @@ def _said(name: str, value: float | None) -> str:
 
 
 def open_loops(run: Path) -> list[Result]:
-    """The open-loop evaluations of a run's last checkpoint; on its validation episodes first.
+    """The open-loop evaluations of a run's last checkpoint; its validation episodes come first.
 
-    Where several found the same, as `aegis run` and `aegis evaluate` do, the first stands for all.
+    Of several with equal results, such as by `aegis run` and `aegis evaluate`, the first is listed.
     """
     found = dict[str, Result]()
     for _, one in _read(run, OPEN_LOOP, OpenLoopFigures):
-        # The path of the data may be written in several ways, and an earlier version did not tell
+        # The path of the data may be written in several ways, and an earlier version did not record
         # single episodes.
         vary = ("data", "episode_errors")
         told = {name: value for name, value in one.figures.items() if name not in vary}
@@ -373,17 +373,17 @@ def open_loops(run: Path) -> list[Result]:
 def _read(
     run: Path, kind: str, figures: type[ProbeFigures | RolloutFigures | OpenLoopFigures]
 ) -> list[tuple[Path, Result]]:
-    """What was measured of a run's last checkpoint, each with its file."""
+    """The results for a run's last checkpoint, each with its file."""
     last = _last_step(run)
-    # A run that was trained further has forgotten what was measured of it before. Earlier versions
-    # wrote no step for a run.
+    # Results from before further training no longer hold. Earlier versions recorded no step for a
+    # run.
     return [
         (path, found) for path, found, step in _each(run, kind, figures) if step in (None, last)
     ]
 
 
 def steps_measured_before(run: Path) -> list[int]:
-    """The steps of a run that something was measured at, but for its last checkpoint's."""
+    """The steps of a run for which there are results, except its last checkpoint's."""
     kinds = (("probe", ProbeFigures), ("rollout", RolloutFigures), (OPEN_LOOP, OpenLoopFigures))
     steps = {step for kind, figures in kinds for *_, step in _each(run, kind, figures)}
     return sorted(step for step in steps - {None, _last_step(run)} if step is not None)
@@ -392,15 +392,15 @@ def steps_measured_before(run: Path) -> list[int]:
 def _each(
     run: Path, kind: str, figures: type[ProbeFigures | RolloutFigures | OpenLoopFigures]
 ) -> Iterator[tuple[Path, Result, int | None]]:
-    """What was measured of a run's checkpoints: the file, what it says, and of which step."""
+    """The results for a run's checkpoints: the file, its contents and the step."""
     by_recipe, own = [], folder.measured_in(run)
     listed = [] if own is None else [own.glob(f"{kind}.json"), own.glob(f"{kind}-*.json")]
     for path in [path for found in listed for path in sorted(found)]:
-        # What a study measures on validation data chooses its knobs, and is no result.
+        # A study chooses its settings by figures on validation data, so these are not results.
         if not re.match(rf"{kind}-validation(-|$)", path.stem):
             by_recipe.append(path)
-    # A probe that tells less than another of the same questions comes after it: its name goes on
-    # with `-with-...` where the other's ends.
+    # A probe with fewer figures than another of the same questions comes after it, since its name
+    # is the other's followed by `-with-...`.
     apart = sorted((run / FOLDER).glob(f"{kind}-*.json"), key=lambda path: path.stem)
     recipe = recipe_of(run) if by_recipe else None
     for path in [*by_recipe, *apart]:
@@ -412,9 +412,9 @@ def _each(
 
 
 def _is_asked_for(found: Result, kind: str, recipe: recipes.Recipe) -> bool:
-    """Whether the recipe still asks for what `aegis run` has measured.
+    """Whether the recipe still asks for what `aegis run` measured.
 
-    An earlier recipe of the run may have had more question sets, or other colours.
+    The run's earlier recipe may have had more question sets, or other colours.
     """
     if kind == "probe":
         return _number(found, kind) <= len(recipe.probe.of_each_set())
@@ -426,7 +426,7 @@ def evaluated_on(figures: Mapping[str, Any]) -> str:
     """The episodes of an open-loop evaluation in words, such as `3 held-out episodes of arm`."""
     data, count, trained = Path(figures["data"]), len(figures["episodes"]), figures["trained_on"]
     which = {VALIDATION: "held-out ", CHOSEN: "chosen "}.get(figures["split"], "")
-    # A model card tells nobody where a folder lies.
+    # A model card should not contain the path of a folder.
     said = f"{count:,} {which}episode{'s' * (count != 1)} of "
     said += data.name if data.is_absolute() else str(data)
     if figures["split"] == OTHER:
@@ -435,10 +435,10 @@ def evaluated_on(figures: Mapping[str, Any]) -> str:
 
 
 def evaluated_data(run: Path, evaluated: Result) -> str:
-    """Where the demonstrations of an open-loop evaluation lie: an absolute path, or an id.
+    """The demonstrations of an open-loop evaluation: an absolute path, or an id.
 
-    `aegis run` names them as its recipe does, which the folder that it was called in has to
-    complete; the run knows them whole.
+    `aegis run` records the recipe's path, which may be relative to the working directory of that
+    time; the run has the absolute path.
     """
     if "path" in evaluated.settings:
         return str(evaluated.settings["path"])
@@ -450,7 +450,7 @@ def evaluated_data(run: Path, evaluated: Result) -> str:
 
 
 def question_set(probed: Result, recipe: recipes.Recipe) -> str:
-    """The question set of a probe as somebody named it: its own, or one of the recipe's."""
+    """The question set of a probe as the user named it: its own, or one of the recipe's."""
     if "vqa" in probed.settings:
         return str(probed.settings["vqa"])
     sets, place = recipe.probe.of_each_set(), _number(probed, "probe") - 1
@@ -458,22 +458,22 @@ def question_set(probed: Result, recipe: recipes.Recipe) -> str:
 
 
 def _number(found: Result, kind: str) -> int:
-    """Which of the recipe's sets, from 1, something that `aegis run` has measured is of."""
+    """The number, from 1, of the recipe's set to which a result of `aegis run` belongs."""
     number = found.name.removeprefix(kind).lstrip("-") or "1"
     return int(number) if number.isdigit() else 1
 
 
 def gate(probed: Sequence[Result], settings: recipes.Probe) -> bool | None:
-    """Whether every probe passes its gate; None where there is none.
+    """Whether every probe passes its gate; None if there is none.
 
     Args:
-        settings: of the run's recipe, to which the probes of `aegis run` are held.
+        settings: the probe settings of the run's recipe, which apply to the probes of `aegis run`.
     """
     max_drop = settings.max_drop
     verdicts = []
     for result in probed:
         passed, drop = result.figures.get("passed"), result.figures.get("drop_points")
-        # Measured by `aegis run` when its recipe had no gate, and held to the one that it has now.
+        # Measured by `aegis run` when its recipe had no gate; the recipe's present gate applies.
         if passed is None and max_drop is not None and not result.settings and drop is not None:
             interval = result.figures.get("drop_interval")
             passed = passes(drop, interval, max_drop, settings.gate)

@@ -26,10 +26,10 @@ Load = Callable[[Path, str | None], Acting]
 
 
 def load_run(run: Path, task: str | None) -> Acting:
-    """The policy of one training run, and its task: the one trained on, or the one asked for.
+    """The policy of one training run, and its task: the one trained on, or the requested one.
 
     Raises:
-        AegisError: no trained run, another task than the run's, or a policy of several cameras.
+        AegisError: no trained run, another task than the run's, or a policy with several cameras.
     """
     policy, meta = checkpoint.load_policy(run)
     cameras = checkpoint.cameras_of(meta, meta["task"] or task)
@@ -57,17 +57,17 @@ def run(
 ) -> RolloutReport:
     """Act in `episodes` episodes; `replan` actions of each predicted chunk are executed.
 
-    The episodes are the same for every run and method: they depend on the task, the seed and their
-    number alone.
+    The episodes are the same for every run and method: they depend only on the task, the seed and
+    their number.
 
     Args:
         colors: one of TARGET_COLORS; a task without coloured targets has the default only.
-        load: how the folder is read; default: `load_run`, which knows runs of one policy.
+        load: how the folder is read; default: `load_run`, which reads runs of one policy.
         keep: write the report into the run's folder.
         ensemble: decay of a temporal ensemble; None: the policy's own, unless `replan` is given.
-        delay: steps that a prediction takes, in which the robot goes on with the chunk before;
-            None: it waits.
-        guided: whether a delayed chunk continues the one before.
+        delay: steps that a prediction takes, during which the robot continues with the previous
+            chunk; None: it waits.
+        guided: whether a delayed chunk is guided to continue the previous one.
 
     Raises:
         AegisError: no trained run, another task than the run's, colours it does not have, zero
@@ -85,8 +85,7 @@ def run(
         acting = (load or load_run)(Path(run_path), task)
     if acting.rate is not None:
         _check_rate(acting.rate, acting.task, on_event)
-    # Whoever asks for another number of executed actions does without the policy's own ensemble,
-    # which executes one.
+    # A given `replan` disables the policy's own ensemble, which executes one action per prediction.
     decay = acting.ensemble if ensemble is None and replan is None else ensemble
     if not sim.has_colors(acting.task) and colors != DEFAULT:
         raise AegisError(
@@ -113,7 +112,7 @@ def run(
 
 
 def _circumstances(acting: Acting, *settings: Any) -> dict[str, Any]:
-    """What the episodes depend on: the policy, where and how it acts, and what plays them."""
+    """What the episodes depend on: the policy, where and how it acts, and the simulator."""
     policy = acting.policy.fingerprint()
     place = [acting.task, list(acting.cameras), [list(size) for size in acting.sizes]]
     played = circumstances.of_episodes(gl.choose_backend())
@@ -121,7 +120,7 @@ def _circumstances(acting: Acting, *settings: Any) -> dict[str, Any]:
 
 
 def _check_delay(delay: int, replan: int, chunk: int, ensemble: float | None) -> None:
-    """Raise AegisError for a delay that such chunks cannot bridge."""
+    """Raise AegisError for a delay for which chunks are too short."""
     if ensemble is not None:
         raise AegisError(
             f"a delay of {delay} steps with the temporal ensemble {ensemble:g}",
@@ -138,7 +137,7 @@ def _check_delay(delay: int, replan: int, chunk: int, ensemble: float | None) ->
 
 
 def _task(policy: Policy, trained: str | None, asked: str | None) -> str:
-    """The task to act in: the one trained on, or else one asked for that fits the policy."""
+    """The task to act in: the one trained on, or else a requested one that fits the policy."""
     if asked is not None:
         sim.check(asked)
     if trained is not None:
@@ -171,12 +170,12 @@ def _sizes(spec: TaskSpec) -> tuple[int, int]:
 
 
 def _alike(trained: str, asked: str) -> bool:
-    """Whether both are LIBERO's, whose robot is one, and whose data sets have several suites."""
+    """Whether both are tasks of LIBERO, which has one robot, and whose datasets mix suites."""
     return None not in (sim.of_datasets(trained), sim.of_datasets(asked))
 
 
 def _check_rate(rate: float, task: str, on_event: OnEvent) -> None:
-    """Warn of a task whose steps have another length than those of a policy's training."""
+    """Warn about a task whose time step differs from that of the policy's training."""
     spec = sim.make(task).spec
     own = spec.control_hz
     if not any(math.isclose(known, rate, rel_tol=1e-3) for known in (own, spec.said_hz or own)):

@@ -1,10 +1,10 @@
-"""What VLMEvalKit notes of each question, in tables.
+"""What VLMEvalKit records for each question, in tables.
 
 `run.py --work-dir FOLDER` writes the predictions for a benchmark to
-`FOLDER/MODEL/T20260131-120000/MODEL_BENCHMARK.xlsx`. What judges them copies that table, appends
-columns, among them the verdict on each prediction, and writes it beside the first one under a
-longer name: `MODEL_MMStar_exact_matching_result.xlsx`. The folder of the model has links to the
-files of its newest evaluation. By PRED_FORMAT the tables are .tsv or .json instead.
+`FOLDER/MODEL/T20260131-120000/MODEL_BENCHMARK.xlsx`. A judge copies that table, appends columns,
+including the verdict on each prediction, and writes it beside the first one under a longer name:
+`MODEL_MMStar_exact_matching_result.xlsx`. The folder of the model has links to the files of its
+newest evaluation. With PRED_FORMAT the tables are .tsv or .json instead.
 """
 
 from __future__ import annotations
@@ -33,16 +33,16 @@ from aegis_cli.evaluation.question_log import (
 # The folder of one evaluation: T20260131-120000, or T20260131_G1a2b3c4d of older versions, where
 # the second half is the commit.
 _RUN = re.compile(r"T(?P<day>\d{8})(-(?P<time>\d{6})|_G\w+)")
-# Columns with a verdict on each prediction, as the judges of VLMEvalKit call them.
+# Names that VLMEvalKit's judges give to columns with a verdict on each prediction.
 _VERDICTS = frozenset("hit score match correct is_correct verifier_match".split())
 _MATCHES = "eval_match"  # how well a prediction matches each of the reference answers
-# An answer counts for nothing where its distance is larger, in ANLS.
+# In ANLS, an answer with a larger distance scores 0.
 _FARTHEST = 0.5
-# Benchmarks whose questions are asked once for each order of their options, with 1e6 added to the
-# index each time, so that its last digits stay; `g_index`, where it is, says which of them are one.
+# Benchmarks whose questions are asked once for each order of their options. Each time 1e6 is added
+# to the index, so its last digits stay the same; `g_index`, if present, groups them too.
 _CIRCULAR = ("mmbench", "ccbench", "circular", "mmcr")
 _DIGITS = 6
-# By column, what VLMEvalKit writes into it where a verdict tells nothing of the model, and why.
+# Column -> what VLMEvalKit writes into it if a verdict says nothing about the model, and why.
 _DOUBTS = {
     "prediction": ("Failed to obtain answer", "without an answer, because asking the model failed"),
     "log": ("thus randomly generate one", "judged by chance, because the judge had no answer"),
@@ -55,11 +55,11 @@ _APART = "judge the benchmark again, or take this table out of the folder"
 
 @dataclass(frozen=True)
 class _Table:
-    """A table of a model, which has predictions or verdicts.
+    """A table of a model, with predictions or verdicts.
 
     Attributes:
-        model: its folder.
-        name: what of its file's name follows the model's.
+        model: the model's folder.
+        name: the part of its file's name after the model's name.
         is_judged: whether it has verdicts.
     """
 
@@ -70,9 +70,9 @@ class _Table:
 
 
 def holds(place: Path) -> bool:
-    """Whether there is a table that is named as VLMEvalKit names them.
+    """Whether there is a table that is named like VLMEvalKit's.
 
-    Others write .csv and .json of many names, so that those have to have its columns too.
+    Other programs write .csv and .json files with many names, so those must also have its columns.
     """
     return any(
         path.suffix in (".xlsx", ".tsv") or _has_predictions(tables.columns(path))
@@ -91,19 +91,19 @@ def _has_predictions(columns: Sequence[str]) -> bool:
 
 
 def _files(place: Path) -> list[Path]:
-    """The files that may be tables, each once, though there are links to some."""
+    """The files that may be tables, each once even if there are links to it."""
     every = [place] if place.is_file() else place.rglob("*")
     found = {path.resolve() for path in every if path.suffix in tables.SUFFIXES and path.is_file()}
     return sorted(found)
 
 
 def _model_folder(path: Path) -> Path:
-    """The folder of the model that a table is of."""
+    """The folder of a table's model."""
     return path.parent.parent if _RUN.fullmatch(path.parent.name) else path.parent
 
 
 def _name(path: Path) -> str | None:
-    """What of a table's name follows the model's; None unless it begins with that."""
+    """The part of a table's name after the model's name; None if it does not begin with that."""
     begin = f"{_model_folder(path).name}_"
     return path.stem.removeprefix(begin) if path.stem.startswith(begin) else None
 
@@ -112,7 +112,7 @@ def find(place: Path, on_event: OnEvent) -> Tasks:
     """The judged tables of each benchmark's newest evaluation.
 
     Raises:
-        AegisError: none is judged, a table cannot be read, or they are of several models.
+        AegisError: no table is judged, a table cannot be read, or they belong to several models.
     """
     found = list(_tables(place, on_event))
     models = sorted({str(table.model) for table in found})
@@ -140,7 +140,7 @@ def _tables(place: Path, on_event: OnEvent = ignore) -> Iterator[_Table]:
     named = [(path, name) for path in _files(place) if (name := _name(path)) is not None]
     for number, (path, name) in enumerate(named, start=1):
         columns = tables.columns(path)
-        # To open a workbook takes seconds: all its texts stand before its first row.
+        # Opening a workbook takes seconds, since all its texts come before its first row.
         on_event(Progress("scores", number, len(named), "tables opened"))
         if _has_predictions(columns):
             yield _Table(path, _model_folder(path), name, bool(_verdicts(columns)))
@@ -162,8 +162,8 @@ def _nothing_judged(place: Path, found: Sequence[_Table]) -> AegisError:
 def _date(folder: Path) -> str:
     """A text by which evaluations can be sorted.
 
-    Two of one day have no order by their names in older versions; there the later written is the
-    newer one, as VLMEvalKit itself takes it.
+    In older versions the names of two evaluations on one day have no order; then the one written
+    later is the newer one, as in VLMEvalKit itself.
     """
     if (match := _RUN.fullmatch(folder.name)) is None:
         return ""
@@ -172,11 +172,11 @@ def _date(folder: Path) -> str:
 
 
 def _by_task(own: Sequence[_Table], place: Path) -> dict[str, dict[str, Path]]:
-    """The judged tables of one evaluation, by benchmark and by what follows its name.
+    """The judged tables of one evaluation, by benchmark and by the rest of the name.
 
-    A judged table is of the benchmark whose predictions it is named after: of `MMBench` and
-    `MMBench_V11`, `MMBench_V11_openai_result` is the latter's. Without predictions beside it, it
-    goes by its own name.
+    A judged table belongs to the benchmark whose predictions it is named after: given `MMBench` and
+    `MMBench_V11`, `MMBench_V11_openai_result` belongs to the latter. Without predictions beside it,
+    its own name is the benchmark.
     """
     predicted = [table.name for table in _beside(own, place) if not table.is_judged]
     found: dict[str, dict[str, Path]] = {}
@@ -185,13 +185,13 @@ def _by_task(own: Sequence[_Table], place: Path) -> dict[str, dict[str, Path]]:
         task = max(begins, key=len, default=table.name) if table.is_judged else table.name
         files_of_task = found.setdefault(task, {})
         if table.is_judged:
-            # The same table may be there in several formats.
+            # The same table may exist in several formats.
             files_of_task.setdefault(table.name.removeprefix(task).lstrip("_"), table.path)
     return found
 
 
 def _beside(own: Sequence[_Table], place: Path) -> Sequence[_Table]:
-    """All tables of an evaluation, of which a user may have given one."""
+    """All tables of an evaluation, even if the user gave only one."""
     folder = own[0].path.parent
     return [t for t in _tables(folder) if t.path.parent == folder] if place.is_file() else own
 
@@ -199,7 +199,7 @@ def _beside(own: Sequence[_Table], place: Path) -> Sequence[_Table]:
 def _verdicts(columns: Sequence[str]) -> list[str]:
     """The columns with verdicts.
 
-    What judges a table appends them. A column before the prediction is the benchmark's own, be it
+    A judge appends them. A column before the prediction is the benchmark's own, even if it is
     called a score.
     """
     judged = columns[columns.index("prediction") + 1 :]
@@ -207,10 +207,10 @@ def _verdicts(columns: Sequence[str]) -> list[str]:
 
 
 def read(task: str, paths: Mapping[str, Path], reading: Reading) -> QuestionLog:
-    """The verdicts on a benchmark's predictions, of all its judged tables.
+    """The verdicts on a benchmark's predictions, from all its judged tables.
 
     Raises:
-        AegisError: a table cannot be read, a row has no index or no verdict, or two have one index.
+        AegisError: a table cannot be read, a row has no index or no verdict, or an index repeats.
     """
     log = QuestionLog(next(iter(paths.values())))
     for judged, path in paths.items():
@@ -247,7 +247,7 @@ def _add(log: QuestionLog, task: str, judged: str, path: Path) -> None:
 
 
 def _asked(row: Mapping[str, Any]) -> tuple[Any, Any]:
-    """What was asked, with the options, and the reference answer, as far as the table has them."""
+    """The question with its options, and the reference answer, if the table has them."""
     options = {name: _text(cell) for name, cell in row.items() if name in string.ascii_uppercase}
     given = [f"{name}. {text}" for name, text in options.items() if text is not None]
     question = _text(row.get("question"))
@@ -255,7 +255,7 @@ def _asked(row: Mapping[str, Any]) -> tuple[Any, Any]:
 
 
 def _shared(task: str, index: str, row: Mapping[str, Any]) -> str | None:
-    """What a question shares with others: it is one of them in another order, or of one image."""
+    """What a question shares with others: its text in another order of options, or its image."""
     group = _text(row.get("g_index"))
     if group is None and index.isdecimal() and any(part in task.lower() for part in _CIRCULAR):
         group = index[-_DIGITS:].lstrip("0")
@@ -264,31 +264,31 @@ def _shared(task: str, index: str, row: Mapping[str, Any]) -> str | None:
 
 
 def _is_blank(cell: Any) -> bool:
-    """Whether a cell has nothing in it, as pandas writes what it does not know."""
+    """Whether a cell is empty, including pandas' missing values."""
     if isinstance(cell, float):
         return math.isnan(cell)
     return cell is None or (isinstance(cell, str) and cell.strip().lower() in ("", "nan"))
 
 
 def _text(cell: Any) -> str | None:
-    """What a cell says, whether its format keeps it as a number or a text; None if it is blank."""
+    """A cell as text, whether its format stores a number or text; None if it is blank."""
     if _is_blank(cell):
         return None
     text = str(cell).strip()
-    # A column of whole numbers with a blank in it is one of floats in pandas.
+    # In pandas, a column of integers with a blank becomes a column of floats.
     return text.removesuffix(".0") if re.fullmatch(r"-?\d+\.0", text) else text
 
 
 def _verdict(task: str, column: str, cell: Any) -> float | None:
-    """A verdict as a number; None where it is none."""
+    """A verdict as a number; None if it is not one."""
     return _hit(task, cell) if column == _MATCHES else _number(cell)
 
 
 def _hit(task: str, cell: Any) -> float | None:
-    """What a prediction's matches with each reference answer come to, as VLMEvalKit counts them.
+    """The score of a prediction's matches with each reference answer, as VLMEvalKit computes it.
 
-    This is `hit_calculate` of its `vqa_eval.py`, for `eval_score` beside the matches is another
-    figure: of DocVQA and InfoVQA it is a mean of distances, of which less is better.
+    This is `hit_calculate` of its `vqa_eval.py`. The column `eval_score` beside the matches is
+    another figure: for DocVQA and InfoVQA it is a mean distance, for which lower is better.
     """
     parts = cell if isinstance(cell, list) else str(cell).strip().strip("[]").split(",")
     matches = [_number(part) for part in parts]
@@ -304,7 +304,7 @@ def _hit(task: str, cell: Any) -> float | None:
 
 
 def _number(cell: Any) -> float | None:
-    """A finite number, which may be written as a text; a truth value is 1 or 0."""
+    """A finite number, which may be written as text; a boolean is 1 or 0."""
     text = str(cell).strip()
     if text.lower() in ("true", "false"):
         return float(text.lower() == "true")

@@ -1,4 +1,4 @@
-"""A few wrong answers with their images, small enough to be kept beside a probe's figures."""
+"""A few wrong answers with their images, small enough to keep with a probe's figures."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from aegis_cli.data.vqa.dataset import VQASet
 from aegis_cli.data.vqa.metrics import Graded
 
 MOST = 12  # answers
-_SIDE = 96  # pixels; larger images are kept in fewer rows and columns
+_SIDE = 96  # pixels; larger images are subsampled
 
 
 def examples(graded: Sequence[Graded], asked: VQASet, size: int | None) -> list[dict[str, Any]]:
@@ -22,10 +22,10 @@ def examples(graded: Sequence[Graded], asked: VQASet, size: int | None) -> list[
 
     Args:
         graded: answers in the order of the set's questions.
-        size: side of the images that the model reads; None keeps that of the set.
+        size: side of the images that the model reads; None: the size in the set.
 
     Returns:
-        Family, question, what was said, the reference answer, and the image as base64 of a PNG.
+        Family, question, the answer given, the reference answer, and the image as base64 of a PNG.
     """
     families: dict[str, list[Graded]] = {}
     for answer in graded:
@@ -61,10 +61,10 @@ def _small(image: np.ndarray) -> np.ndarray:
 
 
 def png(image: np.ndarray) -> bytes:
-    """A PNG of an image [H, W, 3] uint8, written without Pillow, which is an extra.
+    """A PNG of an image [H, W, 3] uint8, written without Pillow, an optional dependency.
 
-    The format is that of ISO/IEC 15948: a header, the zlib-compressed rows, each after the number
-    of its filter (0: none), and an end.
+    The format is that of ISO/IEC 15948: a header, the zlib-compressed rows, each preceded by the
+    number of its filter (0: none), and an end.
     """
     height, width = image.shape[:2]
     rows = np.zeros((height, 1 + 3 * width), np.uint8)

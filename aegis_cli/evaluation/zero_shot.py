@@ -1,4 +1,4 @@
-"""How well a dual encoder names the pictures of stream tasks that it was never trained on."""
+"""How well a dual encoder classifies the images of stream tasks that it was not trained on."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ BATCH = 250
 
 @torch.inference_mode()
 def accuracy(encoder: DualEncoder, task: StreamTask, part: Part) -> float:
-    """Share of a part's images whose nearest class, by the mean over all templates, is theirs."""
+    """Share of a part's images that are nearest to their own class's mean over all templates."""
     weights = class_weights(encoder, task.classes, task.templates)
     right = 0
     for rows in torch.arange(len(part)).split(BATCH):

@@ -47,12 +47,11 @@ def inspect(path: Path) -> InspectReport | StreamInspection:
     """Determine what a folder is.
 
     Raises:
-        UnknownFolder: nothing we know.
-        AegisError: damaged, a run without a ledger yet, or a stream that is not
-            learned to its end.
+        UnknownFolder: an unknown kind of folder.
+        AegisError: damaged, a run without a ledger yet, or a stream that is not fully learned.
     """
-    # The order matters: a run of a stream has a recipe too, and a checkpoint has the folder of a
-    # model in it.
+    # The order matters: a run of a stream has a recipe too, and a checkpoint contains the folder of
+    # a model.
     if recipes.is_stream_run(path):
         report = stream_files.read(path)
         return StreamInspection(report.kind, str(path), report)
@@ -94,7 +93,7 @@ def is_questions(path: Path) -> bool:
 
 
 def _policy_folder(path: Path) -> InspectReport:
-    """A policy without its run, as `aegis export` writes it: its expert's header, its backbone."""
+    """A policy without its run, as written by `aegis export`: its expert's header, its backbone."""
     found, inside = file.inspect(path / checkpoint.EXPERT), path / "backbone"
     own = _hub_model(inside) if model_folder.is_model(inside) else None
     backbone: dict[str, Any] = {"kind": "embedded"}
@@ -105,8 +104,8 @@ def _policy_folder(path: Path) -> InspectReport:
 
 
 def _foreign_policy(path: Path, kind: str) -> InspectReport:
-    """A policy of LeRobot's, by its weights' headers, and how its VLM is measured."""
-    # Beside the weights lie the scales of LeRobot's steps, as policy_preprocessor_*.safetensors.
+    """A policy of LeRobot, by its weights' headers, and how to measure its VLM."""
+    # policy_preprocessor_*.safetensors beside the weights hold scales of LeRobot's processor steps.
     parts = [part for part in model_folder.weights(path) if not part.name.startswith("policy_")]
     tensors = tuple(info for part in parts for info in _tensor_infos(part))
     count = sum(math.prod(tensor.shape) for tensor in tensors)
@@ -115,7 +114,7 @@ def _foreign_policy(path: Path, kind: str) -> InspectReport:
 
 
 def _hub_model(path: Path) -> InspectReport:
-    """A folder of the Hugging Face hub's layout, by its configuration and its weights' headers."""
+    """A folder in the Hugging Face hub's layout, by its configuration and its weights' headers."""
     config = files.load_json(path / "config.json")
     if not isinstance(config, dict) or not isinstance(config.get("model_type"), str):
         found = f"'{path / 'config.json'}' without a model_type"
@@ -195,7 +194,7 @@ def _run_folder(path: Path, at: Path | None = None) -> InspectReport:
 
 
 def _with_results(report: InspectReport, path: Path, settings: Recipe) -> InspectReport:
-    """Add to a run's report what was measured of it."""
+    """Add a run's results to its report."""
     facts = dict(report.facts)
     if before := results.steps_measured_before(path):
         facts["measured_before"] = before
@@ -218,7 +217,7 @@ def _run_facts(
     settings: Recipe,
     metrics: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """The facts of a run, as it is now or was after `until` steps."""
+    """The facts of a run, now or after `until` steps."""
     which: dict[str, Any] = {"checkpoints": [at.name for at in checkpoint.numbered(path)]}
     if until is not None:
         which = {"run": str(path), "checkpoint": f"{until:06d}"}

@@ -1,1 +1,1 @@
-"""A fine-tuned backbone moved back towards the pre-trained one, after its training."""
+"""Move a fine-tuned backbone back towards the pre-trained one after its training."""

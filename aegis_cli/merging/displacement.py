@@ -13,19 +13,19 @@ from aegis_cli.merging.task_factors import dense_sites
 from aegis_cli.methods.site_weights import weights
 from aegis_cli.models.backbones.base import Backbone
 
-# Site, displacement of its weight and bias, strength -> what is kept of the displacement.
+# Site, displacement of its weight and bias, strength -> the part of the displacement to keep.
 Keep = Callable[[str, Pair, float], Pair]
 
 
 class Displacement:
     """How far a backbone has moved since its pre-training, of which any part can be kept.
 
-    Linear maps and convolutions, with their biases, keep what a method says. All other parameters
-    (normalisations, tables, lone rows) have no two factors to say what the task needs of them. They
-    keep the maps' mean share <X, D> / <D, D>, X being what all maps together keep of their D: so
-    they are where the maps are on the way back, and a linear merge treats all parameters alike.
-    Where no map has moved, they keep what the method says of each as of a map; only the linear one
-    does, and `rules.keep` refuses the others.
+    Linear maps and convolutions, with their biases, keep what the method decides. All other
+    parameters (normalisations, tables, lone rows) have no two factors that show what the task needs
+    of them. They keep the maps' mean share <X, D> / <D, D>, where X is what all maps together keep
+    of their displacement D. So they move back as far as the maps do on average, and a linear merge
+    treats all parameters alike. If no map has moved, the method decides for each of them as for a
+    map; only the linear method can, and `rules.keep` refuses the others.
     """
 
     def __init__(self, backbone: Backbone, base: Backbone, keep: Keep) -> None:
@@ -44,11 +44,11 @@ class Displacement:
         """Give the backbone the weights of a merge of this strength; 0 gives the fine-tuned ones.
 
         Returns:
-            The maps' mean kept share of the displacement, from 0 to 1; that of all others where no
-            map has moved.
+            The maps' mean kept share of the displacement, from 0 to 1; that of the other parameters
+            if no map has moved.
         """
         if strength == 0:
-            # Copied, since the base plus the whole displacement would be rounded.
+            # Copied, since adding the whole displacement to the base would round.
             self._backbone.load_state_dict(self._tuned.state_dict())
             return 1.0
         share = self._move(self._maps(), strength)
@@ -61,7 +61,7 @@ class Displacement:
         return share
 
     def _maps(self) -> Iterator[tuple[str, Pair, Pair, Pair]]:
-        """Each map's site, and its weights of now, of before the fine-tuning and of after it."""
+        """Each map's site, and its weights now, before fine-tuning and after it."""
         for site in self._sites:
             now = weights(self._backbone, site)
             origin = weights(self._base, site)
@@ -69,7 +69,7 @@ class Displacement:
             yield site, now, origin, tuned
 
     def _others(self) -> Iterator[tuple[str, Pair, Pair, Pair]]:
-        """The same of each parameter that is of no map, by its name."""
+        """The same for each parameter that belongs to no map, by its name."""
         in_maps = set[int]()
         for _, now, _, _ in self._maps():
             in_maps.update(id(tensor) for tensor in present(now))
@@ -85,10 +85,10 @@ class Displacement:
                 yield name, (now, None), (origin, None), (tuned, None)
 
     def _move(self, parts: Iterable[tuple[str, Pair, Pair, Pair]], strength: float) -> float | None:
-        """Set the weights of each part in turn, as the method says.
+        """Set the weights of each part in turn, as the method decides.
 
         Returns:
-            The mean kept share of their displacement; None where none has moved.
+            The mean kept share of their displacement; None if none has moved.
         """
         along, squared = 0.0, 0.0
         for site, now, origin, tuned in parts:
@@ -99,5 +99,5 @@ class Displacement:
                 parameter.copy_(start + part)  # in float32 or wider, rounded to its type once
                 along += float(dot(part, way))  # <X, D>
                 squared += float(dot(way, way))  # <D, D>
-        # In bases that are not orthogonal, rounding can lead past either end.
+        # If the bases are not orthogonal, rounding can lead past either end.
         return min(max(along / squared, 0.0), 1.0) if squared else None

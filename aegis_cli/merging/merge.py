@@ -1,6 +1,6 @@
-"""`aegis merge`: a fine-tuned backbone moves back towards the pre-trained one.
+"""`aegis merge`: move a fine-tuned backbone back towards the pre-trained one.
 
-It does so where the robot task does not need what it has learned; the action expert stays.
+It gives up what the robot task does not need; the action expert is unchanged.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ from aegis_cli.merging.settings import GRIDS, MergeSettings, check_strength
 
 @dataclass(frozen=True)
 class MergePoint:
-    """One strength, judged on data for validation.
+    """One strength, judged on validation data.
 
     Attributes:
-        kept: the maps' mean share of the displacement that is left, in [0, 1].
+        kept: the maps' mean kept share of the displacement, in [0, 1].
         accuracy: on validation questions, in [0, 1]; the drop from the pre-trained model's is in
             percentage points, with its 95 % interval over images.
-        validation_loss: of the policy on held-out episodes; None without a policy.
-        task_accuracy: on validation questions of the task; None where the task has none.
+        validation_loss: the policy's on held-out episodes; None without a policy.
+        task_accuracy: on validation questions of the task; None if the task has none.
     """
 
     strength: float
@@ -51,15 +51,15 @@ class MergeReport:
     """What was merged, and how.
 
     Attributes:
-        strength: of the merge that was written; None: nothing was.
-        kept: its maps' mean share of the displacement.
-        validation_loss: of the merged policy on held-out episodes; None where it was not tried.
+        strength: strength of the merge that was written; None if nothing was.
+        kept: the mean kept share of its maps' displacement.
+        validation_loss: the merged policy's on held-out episodes; None if it was not evaluated.
         baseline_accuracy: the pre-trained model's on the validation questions; None without a
-            sweep, as `questions` is 0 then and `points` is empty.
-        points: the sweep, weakest first, beginning with 0, which is the fine-tuned model.
-        passed: whether a strength keeps `max_drop`; None without that limit.
-        gate: what of the drop that limits, MEAN or UPPER; None without it.
-        vqa, ask: the questions of a sweep, and what they became; None without one.
+            sweep, when `questions` is 0 and `points` is empty.
+        points: the sweep, weakest first, starting with 0, the fine-tuned model.
+        passed: whether some strength stays within `max_drop`; None without that limit.
+        gate: what that limit applies to, MEAN or UPPER; None without it.
+        vqa, ask: the questions of a sweep and their prompt; None without one.
     """
 
     method: str
@@ -97,18 +97,18 @@ def run(
     """Write the merge of one strength, or try several.
 
     Args:
-        target: a run's or checkpoint's folder, or a model's.
-        out: the folder to write, shaped as the target is; None: nothing is written.
-        strength: the one that is written; None: the strengths of `sweep` are tried.
+        target: the folder of a run, a checkpoint or a model.
+        out: the folder to write, with the same layout as the target; None: nothing is written.
+        strength: the strength to write; None: the strengths of `sweep` are tried.
         sweep: empty: the method's own grid.
-        max_drop: of a sweep, the weakest merge is written that loses at most these percentage
-            points of accuracy on validation questions.
-        judged: of one strength, whether the task is tried on validation data, as a sweep does.
-        gate: what of the drop `max_drop` limits, MEAN or UPPER.
+        max_drop: a sweep writes the weakest merge that loses at most this many percentage points of
+            accuracy on validation questions.
+        judged: whether a single strength is evaluated on the task's validation data, like a sweep.
+        gate: what `max_drop` limits, MEAN or UPPER.
 
     Raises:
-        AegisError: nothing that can be merged, or not by this method, or another process that is
-            writing to `out`.
+        AegisError: nothing that can be merged, a method that cannot merge it, or another process
+            that is writing to `out`.
         Diverged: weights or a loss that are not finite.
     """
     if out is not None:
@@ -133,7 +133,7 @@ def _merge(
         check_strength(settings.method, each)
     source = sources.find(target, settings, on_event)
     sources.check_moved(source)
-    # Before any weight is changed: the task's factors are those of the fine-tuned weights.
+    # Before any weight is changed, since the task's factors belong to the fine-tuned weights.
     keep = rules.keep(source, settings, on_event)
     displacement = Displacement(source.backbone, source.base, keep)
     tried, chosen = _Sweep(), strength
@@ -142,7 +142,7 @@ def _merge(
         chosen = _chosen(tried, target, max_drop, gate, on_event)
     kept = loss = None
     if chosen is not None and out is not None:
-        kept = displacement.keep(chosen)  # a sweep has left the weights of its strongest
+        kept = displacement.keep(chosen)  # a sweep leaves the weights of its last strength
         loss = tried.loss_at(chosen)
         if judged:
             loss = _performance(source, chosen).get("validation_loss")
@@ -169,14 +169,14 @@ def _merge(
 
 @dataclass(frozen=True)
 class _Sweep:
-    """The strengths that were tried, as `MergeReport` has them; none where one was given."""
+    """The strengths that were tried, as in `MergeReport`; empty if a single one was given."""
 
     points: tuple[MergePoint, ...] = ()
     baseline_accuracy: float | None = None
     questions: int = 0
 
     def loss_at(self, strength: float) -> float | None:
-        """The policy's loss at one of the strengths; None of another, or without a policy."""
+        """The policy's loss at one of the strengths; None for another one, or without a policy."""
         return {point.strength: point.validation_loss for point in self.points}.get(strength)
 
 
@@ -187,7 +187,7 @@ def _made(
     kept: float,
     loss: float | None,
 ) -> dict[str, Any]:
-    """What the merged weights' own files say of how they were made."""
+    """What the files of the merged weights say about how they were made."""
     return {
         "method": settings.method,
         "strength": strength,
@@ -200,7 +200,7 @@ def _made(
 
 
 def _performance(source: sources.Source, strength: float) -> dict[str, float]:
-    """How well the task is done with the backbone's weights of now.
+    """How well the task is done with the backbone's current weights.
 
     Raises:
         Diverged: a figure that is not finite.
@@ -211,7 +211,7 @@ def _performance(source: sources.Source, strength: float) -> dict[str, float]:
 
 
 def _measured_on(source: sources.Source, settings: MergeSettings) -> dict[str, Any]:
-    """What the method has read of the task and of questions, for whoever merges so again."""
+    """What the method measured the task and the questions on, so that a merge can be repeated."""
     if settings.method == "linear":
         return {}
     found: dict[str, Any] = {}
@@ -227,9 +227,9 @@ def _measured_on(source: sources.Source, settings: MergeSettings) -> dict[str, A
 
 
 class _Judge:
-    """Asks validation questions of the merged model, and tries its task on validation data.
+    """Asks the merged model validation questions, and evaluates its task on validation data.
 
-    Answers and figures are kept by the weights that gave them: an interrupted sweep goes on.
+    Answers and figures are saved by the weights that gave them, so an interrupted sweep can resume.
     """
 
     def __init__(self, source: sources.Source, settings: MergeSettings, on_event: OnEvent) -> None:
@@ -255,7 +255,7 @@ class _Judge:
         return probe.compare(self._before, None, [], None)
 
     def point(self, strength: float, kept: float) -> MergePoint:
-        """What the backbone's weights of now are worth."""
+        """Evaluate the backbone's current weights."""
         merged = kept_answers.of_now(self._source.backbone)
         after = kept_answers.ask(merged, self._asked, self._size, ALONE, ignore)
         report = probe.compare(after, self._before, [], None)
@@ -266,7 +266,7 @@ class _Judge:
         )
 
     def _performance(self, strength: float) -> dict[str, float]:
-        """How well the task is done, as it was found before or is now."""
+        """How well the task is done, from saved figures or measured now."""
         by = files.sha256_value(self._source.judged_by())
         if by not in self._known:
             self._known[by] = _performance(self._source, strength)
@@ -283,7 +283,7 @@ def _try(
     max_drop: float | None,
     on_event: OnEvent,
 ) -> _Sweep:
-    """Judge each of the strengths in turn, the weakest first, and the fine-tuned model before."""
+    """Judge the fine-tuned model, then each of the strengths, the weakest first."""
     judge = _Judge(source, settings, on_event)
     if max_drop is not None:
         probe.warn_of_little_knowledge(
@@ -302,9 +302,9 @@ def _try(
 def _chosen(
     tried: _Sweep, target: str, max_drop: float | None, gate: str, on_event: OnEvent
 ) -> float | None:
-    """The strength of a sweep that is written, if one is; says where the figures decide little."""
+    """The strength of a sweep to write, if any; warns if the figures decide little."""
     chosen = _weakest(tried.points, max_drop, gate)
-    # The one that passes, or the strongest, which comes nearest to it.
+    # The one that passes, or else the strongest, which comes closest to passing.
     judged_by = tried.points[-1]
     for point in tried.points:
         if point.strength == chosen:
@@ -319,7 +319,7 @@ def _chosen(
 
 
 def _weakest(points: Sequence[MergePoint], max_drop: float | None, gate: str) -> float | None:
-    """The smallest strength that passes: of those that keep the answers, the strongest policy."""
+    """The smallest strength that passes: it changes the policy least while keeping the answers."""
     if max_drop is None:
         return None
     passing = []

@@ -1,4 +1,4 @@
-"""The four ways to say what a map keeps of its displacement."""
+"""The four methods of deciding what a map keeps of its displacement."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ from aegis_cli.methods.site_weights import weights
 from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.recipes import MERGE_NEEDS
 
-_CPU = torch.device("cpu")  # where eigenvectors are found, one map at a time
+_CPU = torch.device("cpu")  # eigenvectors are computed there, one map at a time
 
 
 def keep(source: Source, settings: MergeSettings, on_event: OnEvent) -> Keep:
-    """What the method says, once all that it reads is measured.
+    """The method's rule, after measuring everything that it reads.
 
     Raises:
-        AegisError: no map that has moved, an anchor of another model or without the method's part,
-            or nothing that says what the task needs.
+        AegisError: no map has moved, an anchor of another model or without the method's part, or
+            nothing that shows what the task needs.
     """
     if settings.method == "linear":
         return lambda _, moved, strength: _scaled(moved, 1 - strength)
     part = MERGE_NEEDS[settings.method]
-    # What the user has frozen has no displacement, and the anchor need not have measured it.
+    # Maps that the user froze have no displacement, and the anchor may lack them.
     sites = [site for site in dense_sites(source.backbone) if _moved(source, site)]
     if not sites:
         raise AegisError(
@@ -65,10 +65,10 @@ def _moved(source: Source, site: str) -> bool:
 
 
 def _given(path: Path, source: Source, settings: MergeSettings, part: str) -> Anchor:
-    """The part of the anchor in a file.
+    """The part of an anchor in a file.
 
     Raises:
-        AegisError: no anchor, that of another model, or one without the part.
+        AegisError: no anchor, an anchor of another model, or one without the part.
     """
     found = anchor_file.load(path, source.base.fingerprint())
     if not getattr(found, part):
@@ -118,7 +118,7 @@ def _scaled(moved: Pair, share: float) -> Pair:
 
 
 def _shrink(source: Source, anchor: Anchor, sites: list[str], damping: float) -> Keep:
-    """The proximal step of the method `kfac`, once, from the fine-tuned weights."""
+    """One proximal step of the method `kfac` from the fine-tuned weights."""
     likes = {site: weights(source.base, site)[0] for site in sites}
     found = curvatures(anchor, likes, damping)
 
@@ -143,11 +143,11 @@ def _two_sided(
     """What `core.merging.TwoSided` keeps of each map.
 
     Args:
-        task: the task's spectra; each is dropped when its map's bases are made.
+        task: the task's spectra; each is dropped once its map's bases are made.
         sites: the maps that have moved.
-        sides: names of both factors; None: inputs alone, by the map's own name.
+        sides: names of both factors; None: inputs only, by the map's own name.
     """
-    names = {}  # of each map's spectra: one, or that of either side
+    names = {}  # the names of each map's spectra: one, or one per side
     for site in sites:
         names[site] = [f"{site}.{side}" for side in sides] if sides else [site]
     wanted = {name for own in names.values() for name in own}
@@ -165,7 +165,7 @@ def _two_sided(
                 continue  # the task does not depend on the map
             pairs = [(task.pop(name), questions[name]) for name in own]
             if not any(_directions(spectrum) for spectrum in pairs[-1]):
-                pairs = pairs[:1]  # only the outputs' traces are known: all are alike
+                pairs = pairs[:1]  # only the outputs' traces are known: all directions are alike
             found = []
             for of_task, of_questions in pairs:
                 found.append(basis(damped(of_task, damping), damped(of_questions, damping)))
@@ -175,7 +175,7 @@ def _two_sided(
     def kept(site: str, moved: Pair, strength: float) -> Pair:
         if site not in moving:
             return moved
-        if site not in bases:  # the task needs nothing of it: back to the pre-trained weights
+        if site not in bases:  # the task does not need it: back to the pre-trained weights
             return _scaled(moved, 0)
         # The bases are on the CPU, where they were found.
         weight, _ = moved

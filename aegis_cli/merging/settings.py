@@ -1,4 +1,4 @@
-"""How `aegis merge` moves a backbone back, and what it measures for that."""
+"""The settings of `aegis merge`: how it moves a backbone back, and what it measures for that."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from aegis_cli.common.errors import AegisError
 from aegis_cli.data.selection import Paths
 
 DAMPING = 0.01
-# Strengths of a sweep in which none are named: each method's from little to nearly all of the way.
+# Default strengths of a sweep for each method, from little to nearly all of the way back.
 GRIDS = {
     "linear": (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8),
     "kfac-shrink": (0.003, 0.01, 0.03, 0.1, 0.3, 1.0),
@@ -20,23 +20,23 @@ GRIDS = {
 
 @dataclass(frozen=True)
 class MergeSettings:
-    """All but the strength.
+    """All settings but the strength.
 
     Attributes:
         method: one of `MERGES`.
-        damping: added to each eigenvalue of every factor, whose mean is 1.
+        damping: added to each eigenvalue of every factor; a factor's mean eigenvalue is 1.
         base: the pre-trained model; None: the one that the run's recipe names.
-        demos: of the run, one set or all of several; None: those that its recipe names, or that lie
-            beside it.
-        anchor: of the base; None: it is measured on `samples` questions of `vqa`.
-        vqa: the questions whose answers are to be kept.
-        ask: what a question becomes before a model reads it, with {} for it.
+        demos: the run's demonstrations, one set or all of several; None: those that its recipe
+            names, or that are beside it.
+        anchor: the base's anchor; None: it is measured on `samples` questions of `vqa`.
+        vqa: the questions whose answers should be kept.
+        ask: template of the prompt, with {} for the question.
         task_vqa: the task as questions, for a model without a run.
-        samples: questions that the anchor is measured on where none is given.
+        samples: number of questions that the anchor is measured on if none is given.
         temperature: what their answers' scores are divided by before the curvature's words are
             drawn from them.
-        frames: of demonstrations that the task's factors are measured on.
-        questions: for validation, of each set.
+        frames: number of demonstration frames that the task's factors are measured on.
+        questions: number of validation questions of each set.
         batch_size: questions per forward pass.
     """
 
@@ -57,7 +57,7 @@ class MergeSettings:
 
 
 def check_strength(method: str, strength: float) -> None:
-    """Raise AegisError for a strength that the method does not take."""
+    """Raise AegisError for a strength that the method does not accept."""
     if method == "linear" and strength > 1:
         raise AegisError(
             f"strength {strength:g} of a linear merge",

@@ -46,12 +46,12 @@ The fine-tuned model was moved back towards the pre-trained `{base}` by `aegis m
 
 
 class Source(Protocol):
-    """A fine-tuned backbone, its pre-trained one, and what the fine-tuning was for.
+    """A fine-tuned backbone, its pre-trained one, and the task of the fine-tuning.
 
     Attributes:
         backbone: fine-tuned; a merge changes its weights.
         base: pre-trained, on the same device.
-        base_name: as a user names it.
+        base_name: as the user names it.
     """
 
     backbone: Backbone
@@ -59,23 +59,23 @@ class Source(Protocol):
     base_name: str
 
     def task_spectra(self, part: str) -> dict[str, Spectrum]:
-        """What an anchor's `part` ("inputs" or "curvature") would hold, of the task instead."""
+        """An anchor's `part` ("inputs" or "curvature"), but measured on the task."""
 
     def performance(self) -> dict[str, float]:
-        """How well the task is done, on data for validation: `validation_loss` or `task_accuracy`.
+        """How well the task is done on validation data: `validation_loss` or `task_accuracy`.
 
-        It is empty where nothing says so.
+        It is empty if there is no such data.
         """
 
     def judged_by(self) -> dict[str, Any]:
-        """All that `performance` depends on, as JSON: the weights of now, too."""
+        """Everything that `performance` depends on, as JSON, including the current weights."""
 
     def write(self, out: Path, merged: Mapping[str, Any]) -> None:
         """Write the merged weights, all or nothing; `merged` says how they were made."""
 
 
 def find(target: str, settings: MergeSettings, on_event: OnEvent) -> Source:
-    """What a user names: a run or one of its checkpoints, else a model with its `--base`.
+    """The source that a user names: a run, one of its checkpoints, or a model with its `--base`.
 
     Raises:
         AegisError: nothing that can be merged, or a pre-trained model that does not belong to it.
@@ -113,7 +113,7 @@ class PolicyRun:
         self.base_name = settings.base or self._recipe.backbone
         with loading_told("merge", on_event):
             self.base = backbones.load(self.base_name).to(devices.pick())
-            self._check_base()  # before the policy is loaded, which is as large again
+            self._check_base()  # before loading the policy, which is equally large
             policy, self._meta = checkpoint.load_policy(self._checkpoint)
         self._policy = policy.to(devices.pick())
         self.backbone = self._policy.backbone
@@ -145,7 +145,7 @@ class PolicyRun:
 
         def fill(folder: Path) -> None:
             self._copy_records(folder, out, step)
-            # The same place as in the run, so that whatever reads a run reads the merge too.
+            # The same path as in a run, so that code that reads a run also reads the merge.
             target = folder / "checkpoints" / f"{step:06d}"
             target.mkdir(parents=True)
             checkpoint.write_policy(
@@ -162,19 +162,19 @@ class PolicyRun:
         _write_whole(out, fill)
 
     def _copy_records(self, folder: Path, out: Path, step: int) -> None:
-        """What is known of the training; of its log and ledger, up to the step merged.
+        """Copy the records of the training; log and ledger up to the merged step.
 
         Args:
-            folder: where it is written.
-            out: where that is going to lie.
+            folder: where they are written.
+            out: the final path of that folder.
         """
         for name in ("recipe.yaml", run_folder.METRICS, machine.NAME):
-            # An earlier Aegis did not say on which machine it trained, nor where its inputs lay.
+            # Earlier versions recorded neither the machine nor the paths of the inputs.
             if name != machine.NAME or (self._run / name).is_file():
                 shutil.copyfile(self._run / name, folder / name)
         if (kept := places.of(self._run)) is not None:
             places.keep(folder, kept, out, places.began_in(self._run))
-        # A checkpoint before the last one knows nothing of the steps after it.
+        # For a checkpoint before the last one, later steps do not count.
         run_folder.truncate_metrics(folder, step)
         saved = artifacts.load(self._run / "ledger.safetensors", "ledger")
         header = saved.header
@@ -184,7 +184,7 @@ class PolicyRun:
         ledger_file.save(path, ledger, header.meta, header.inputs, header.seed)
 
     def _check_base(self) -> None:
-        """Raise AegisError unless the base is what the training began with."""
+        """Raise AegisError unless the training started from the base."""
         if self.base.fingerprint() != self._header.inputs.get("backbone"):
             raise AegisError(
                 f"the backbone '{self.base_name}', whose weights are others than those that "
@@ -195,11 +195,12 @@ class PolicyRun:
 
     @cached_property
     def _demos(self) -> Demonstrations:
-        """The demonstrations that the policy was trained on, split as they were then."""
+        """The demonstrations that the policy was trained on, with the same split."""
         wanted = self._header.inputs["demos"]
         paths = self._settings.demos or self._find_demos(wanted)
         found = loading.load_demonstrations(self._recipe, self.base, paths, self._on_event)
-        # Of other demonstrations, others are held out, and the policy may have learned from these.
+        # Other demonstrations have another split, so the policy may have trained on what it holds
+        # out.
         if found.sha256 != wanted:
             raise AegisError(
                 f"other demonstrations in {mixture.said(paths)} than those of the run "
@@ -210,7 +211,7 @@ class PolicyRun:
         return found
 
     def _find_demos(self, wanted: str) -> Paths:
-        """Where the run has learned from them, where its recipe says, or a file beside it."""
+        """Their path in the run's records, in its recipe, or of a file beside it."""
         kept = places.of(self._run)
         if kept is not None and not any(map(places.is_gone, kept.demos)):
             return tuple(map(Path, kept.demos))
@@ -226,7 +227,7 @@ class PolicyRun:
         )
 
     def _card(self, merged: Mapping[str, Any]) -> str:
-        """The model card of a Hugging Face backbone, with what was done to it since."""
+        """The model card of a Hugging Face backbone, with a section about the merge."""
         before = self._checkpoint / checkpoint.BACKBONE / "README.md"
         if not before.is_file():
             return ""
@@ -254,14 +255,14 @@ def _run_of(path: Path) -> Path:
 
 @dataclass(frozen=True)
 class _Asked:
-    """The task's questions: those that are measured, and those for validation."""
+    """The task's questions: those for measuring, and those for validation."""
 
     measured: VQASet
     validation: VQASet
 
 
 class ModelFolder:
-    """A fine-tuned model, ours or of the Hugging Face Hub, whose task is questions, if anything."""
+    """A fine-tuned model, ours or from the Hugging Face Hub; its task, if any, is questions."""
 
     def __init__(self, target: str, settings: MergeSettings, on_event: OnEvent) -> None:
         if settings.base is None:
@@ -312,8 +313,8 @@ class ModelFolder:
 
     def write(self, out: Path, merged: Mapping[str, Any]) -> None:
         def fill(folder: Path) -> None:
-            # The fine-tuned model's own type. A policy's run is another matter: its checkpoints
-            # are float32.
+            # In the fine-tuned model's own dtype, unlike a policy's run, whose checkpoints are
+            # float32.
             self.backbone.round_weights(STORED_TYPES[self.backbone.stored])
             self.backbone.save(folder)
             if model_folder.is_model(folder):
@@ -337,7 +338,7 @@ class ModelFolder:
 
 
 def _card(merged: Mapping[str, Any]) -> str:
-    # The straight line between both models reads no curvature that could be damped.
+    # A linear merge reads no curvature that could be damped.
     damped = "" if merged["method"] == "linear" else f". Damping {merged['damping']:g}"
     return _CARD.format(percent=100 * merged["kept"], damped=damped, **merged)
 
@@ -365,7 +366,7 @@ def _check_alike(tuned: Backbone, base: Backbone) -> None:
 
 
 def check_moved(source: Source) -> None:
-    """Raise AegisError where nothing can be moved back."""
+    """Raise AegisError if nothing can be moved back."""
     pairs = zip(source.backbone.parameters(), source.base.parameters(), strict=True)
     if not any(has_moved(source, now, before) for now, before in pairs):
         raise AegisError(
@@ -376,7 +377,7 @@ def check_moved(source: Source) -> None:
 
 
 def has_moved(source: Source, now: Tensor, before: Tensor) -> bool:
-    """Whether a parameter is another one than before, and not but that one rounded.
+    """Whether a parameter has changed by more than rounding.
 
     A model that is stored in half precision may be fine-tuned from one in float32.
     """
@@ -385,7 +386,7 @@ def has_moved(source: Source, now: Tensor, before: Tensor) -> bool:
 
 
 def check_out(out: Path) -> None:
-    """Raise AegisError unless a folder can be written there and none is lost by it."""
+    """Raise AegisError unless a folder can be written there without replacing another."""
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise AegisError(f"'{out}' is not empty", "a new or empty folder", "choose another --out")
     files.make_folder(out.parent)
@@ -394,7 +395,7 @@ def check_out(out: Path) -> None:
 
 
 def _write_whole(out: Path, fill: Callable[[Path], None]) -> None:
-    """Let `fill` write a folder aside, and rename it to `out`."""
+    """Let `fill` write a temporary folder, and rename it to `out`."""
     out = out.resolve()
     with checkpoint.writing(out), files.folder_aside(out) as aside:
         fill(aside)

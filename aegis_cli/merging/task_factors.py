@@ -1,4 +1,4 @@
-"""What a policy's maps read on robot frames, and how its task loss depends on what they write."""
+"""What a policy's maps read on robot frames, and how its task loss depends on their outputs."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.models.policy import Policy
 from aegis_cli.models.structure import Maps
 
-FRAMES = 32  # in a pass at most
-_SEED = 0  # of the flow times and noises
+FRAMES = 32  # per pass at most
+_SEED = 0  # seed of the flow times and noises
 
 
 def dense_sites(backbone: Backbone) -> list[str]:
@@ -32,7 +32,7 @@ def inputs(
 ) -> dict[str, Spectrum]:
     """The second moment of each map's inputs on training frames, by site."""
     recorder = InputRecorder(policy.backbone, _maps(policy.backbone), follow_uses=False)
-    # None: no row is padded (`_passes`), so that every token counts.
+    # None: no row is padded (`_passes`), so every token counts.
     with recorder.watch(None), torch.no_grad():
         for rows in _passes(demos, frames, "task inputs", on_event):
             instructions = [demos.instructions[i] for i in demos.instruction_of[rows].tolist()]
@@ -67,15 +67,15 @@ def curvature(
 
 
 def _maps(backbone: Backbone) -> Maps:
-    # Only linear maps and convolutions have factors in a merge, no tables and no tied heads.
+    # Only linear maps and convolutions have factors in a merge, not tables or tied heads.
     kinds = dict.fromkeys(dense_sites(backbone), "maps")
     return Maps(kinds=kinds, twins={}, heads={}, unknown={})
 
 
 def _passes(demos: Demonstrations, frames: int, stage: str, on_event: OnEvent) -> Iterator[Tensor]:
-    """Frame numbers [B] spread evenly over the training episodes, of one instruction at a time.
+    """Frame numbers [B] spread evenly over the training episodes, one instruction per batch.
 
-    So no row is padded, and hooks on the modules see valid tokens alone.
+    So no row is padded, and hooks on the modules see only valid tokens.
     """
     chosen = demos.train[spread.rows(len(demos.train), frames)]
     done = 0

@@ -1,4 +1,4 @@
-"""Download a policy that `aegis push` has sent to the hub, into the hub's own cache."""
+"""Download a policy that `aegis push` has sent to the hub into the hub's own cache."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from aegis_cli.models import lerobot_folder
 from aegis_cli.models.backbones import model_folder
 
 _EXPERT = "expert.safetensors"  # of a checkpoint's layout
-# All files of a checkpoint's layout, and the small ones of LeRobot's. In any other repository these
-# match hardly more than a configuration.
+# All files of a checkpoint's layout, and the small ones of LeRobot's. In other repositories, hardly
+# more than a configuration matches.
 _PARTS = (lerobot_folder.CONFIG, _EXPERT, f"{lerobot_folder.BACKBONE}/*")
 _CARDS = ("*.md",)
 
@@ -27,7 +27,7 @@ def locate(name: str | Path) -> Path:
         name: a path as the user wrote it, or the id of a policy on the hub, which is downloaded.
 
     Raises:
-        AegisError: it is neither here nor can be downloaded, or the repository has no policy of
+        AegisError: it is not here and cannot be downloaded, or the repository has no policy of
             Aegis.
     """
     # A path on the disk takes precedence over a hub id of the same name, which needs the network.
@@ -36,10 +36,10 @@ def locate(name: str | Path) -> Path:
 
 
 def fetch(name: str) -> Path:
-    """The local folder of a policy on the hub, with its newest files, but for its model card.
+    """The local folder of a policy on the hub, with its newest files except its model card.
 
     Raises:
-        AegisError: neither in the cache nor to be had, or a repository without a policy of ours.
+        AegisError: neither in the cache nor downloadable, or a repository without a policy of ours.
     """
     if not hub.is_installed():
         raise AegisError(
@@ -50,7 +50,7 @@ def fetch(name: str) -> Path:
     folder = _snapshot(name, _PARTS)
     config = folder / lerobot_folder.CONFIG
     if config.is_file() and lerobot_folder.is_own_config(config.read_bytes()):
-        # Its weights have the name of every model's, so they are asked for only now.
+        # Its weights have the same file name as any model's, so they are requested only now.
         return _snapshot(name, (*_PARTS, lerobot_folder.MODEL))
     if (folder / _EXPERT).is_file() and (folder / lerobot_folder.BACKBONE).is_dir():
         return folder

@@ -1,7 +1,7 @@
 """A policy's model card: what it still knows, how well it acts, and how it came to be.
 
-Every figure is one that `aegis probe`, `aegis rollout`, `aegis evaluate` or `aegis run` has written
-into the run.
+Every figure was written into the run by `aegis probe`, `aegis rollout`, `aegis evaluate` or `aegis
+run`.
 """
 
 from __future__ import annotations
@@ -132,7 +132,7 @@ policy = load_policy("{repo}")
 
 @dataclass(frozen=True)
 class Stored:
-    """The type that the VLM's weights are in, by its name, and whether they lost digits by it."""
+    """The name of the VLM weights' dtype, and whether rounding to it lost precision."""
 
     dtype: str
     rounded: bool
@@ -152,21 +152,21 @@ def text(
     Args:
         form: AEGIS for a checkpoint as it is, LEROBOT for one in LeRobot's layout.
         repo: where others find the policy, ORG/NAME on the hub.
-        stored: how the weights are written that the card comes with.
-        cameras: what LeRobot calls the pictures, in their order; empty for the task's own camera.
+        stored: how the weights beside the card are stored.
+        cameras: LeRobot's names of the images, in order; empty for the task's own camera.
 
     Raises:
         AegisError: a run that is damaged.
     """
-    # Of the checkpoint, what is measured; of its run, what it was asked to do.
+    # Results come from the checkpoint, settings from its run.
     recipe = recipes.load(run / "recipe.yaml")
     found = _measured(run, at)
     facts = found.facts
-    # `aegis run` trains several methods of one recipe, so a run's own is its recipe's.
+    # `aegis run` trains several methods by one recipe; each run's own recipe has its method.
     options = without_places(recipes.options(recipe))
     merge, decay = facts.get("merge"), recipe.train.ema_decay
     meta = cast(PolicyMeta, artifacts.read_header(at / checkpoint.EXPERT).meta)
-    # Others have the model that an earlier run began with, and not that run.
+    # Others have the model that an earlier run started from, but not that run.
     began = meta.get("began_as", recipe.backbone)
     known = dataclasses.replace(recipe, backbone=began, probe=_asked(found, recipe))
     looks_by = _looks_by(meta, facts["task"])
@@ -203,11 +203,12 @@ def of_stream(
     meta: PolicyMeta,
     cameras: Sequence[str] = (),
 ) -> str:
-    """The card of the policy of the task of that number, of a stream of robot tasks.
+    """The card of one task's policy in a stream of robot tasks.
 
     Args:
-        form, repo, stored, cameras: as of `text`.
-        meta: of the policy.
+        number: the task's number.
+        form, repo, stored, cameras: as for `text`.
+        meta: the policy's.
 
     Raises:
         AegisError: a run that is damaged.
@@ -241,7 +242,7 @@ def of_stream(
 
 
 def inputs_of_task(inputs: Mapping[str, str], task: str) -> dict[str, str]:
-    """Of the inputs of a stream's run those of one of its tasks, named as those of one policy."""
+    """The inputs of one task of a stream's run, named like those of a single policy."""
     found = {"backbone": inputs["backbone"]} if "backbone" in inputs else {}
     demos = inputs.get(f"demos of {task}")
     return found if demos is None else {**found, "demos": demos}
@@ -250,7 +251,7 @@ def inputs_of_task(inputs: Mapping[str, str], task: str) -> dict[str, str]:
 def _known_after_stream(
     found: SuccessMatrix | ErrorMatrix, recipe: RobotStreamRecipe, repo: str
 ) -> Iterator[str]:
-    """What the stream has measured of the VLM, where it is the one that this policy has."""
+    """The stream's results for the VLM, if this policy has the same VLM."""
     if learners.get(recipe.train.method).trains != "model":
         yield "Not measured: the task's low-rank terms are part of its weights here, and the stream"
         yield f"asked it without them. `{_probe_command(repo, recipe)}` does it."
@@ -262,7 +263,7 @@ def _known_after_stream(
 
 
 def _acting_of_task(found: SuccessMatrix | ErrorMatrix, number: int) -> Iterator[str]:
-    """What the stream has measured of the task after its last one."""
+    """The stream's results for the task, measured after the last task."""
     figure = found.measured_rows[-1][number]
     if isinstance(found, SuccessMatrix):
         yield f"Success, or a suite task's share of the highest return: {_percent(figure)}."
@@ -276,9 +277,9 @@ def _acting_of_task(found: SuccessMatrix | ErrorMatrix, number: int) -> Iterator
 
 
 def _asked(found: InspectReport, recipe: Recipe) -> recipes.Probe:
-    """The probe that the card's first figures are of; the recipe's where none was made."""
+    """The probe of the card's first figures; the recipe's if there are none."""
     first = recipe.probe.of_each_set()[0]
-    if not found.probes or not found.probes[0].settings:  # `aegis run` asks as the recipe says
+    if not found.probes or not found.probes[0].settings:  # `aegis run` probes by the recipe
         return first
     probed = found.probes[0]
     keys = ("vqa", "ask", "questions", "seed")
@@ -287,17 +288,17 @@ def _asked(found: InspectReport, recipe: Recipe) -> recipes.Probe:
 
 
 def _merged(merge: Mapping[str, Any] | None) -> str:
-    """A sentence on a merge after the training; nothing without one."""
+    """A sentence about a merge after the training; empty without one."""
     if not merge:
         return ""
     return f" Merged afterwards: `{json.dumps(without_places(merge), sort_keys=True)}`."
 
 
 def _looks_by(meta: PolicyMeta, task: str | None) -> Sequence[str]:
-    """The cameras of its simulated task that a checkpoint's policy looks by, by the task's names.
+    """The cameras of its simulated task that a checkpoint's policy uses, by the task's names.
 
-    They are empty for the task's own, where there is none, and where the policy has several, but
-    for LIBERO's tasks, by several of whose cameras LeRobot can look.
+    Empty for the task's own camera, if there is no task, and if the policy has several cameras,
+    except in LIBERO's tasks, where LeRobot supports several.
     """
     several = len(meta.get("cameras", ())) > 1
     if task is None or (several and sim.of_datasets(task) is None):
@@ -314,10 +315,10 @@ def _use(
     looks_by: Sequence[str] = (),
     fps: float | None = None,
 ) -> str:
-    """How somebody else uses the policy; one of no simulated task can only be evaluated."""
+    """How others can use the policy; without a simulated task it can only be evaluated."""
     act = f"aegis rollout {repo}" if task else f"aegis evaluate {repo} --demos DEMONSTRATIONS"
     plugins = ["lerobot_policy_aegis"]
-    # A robot of somebody's own needs no simulation, and LeRobot has LIBERO's itself.
+    # A real robot needs no simulation, and LeRobot itself has LIBERO's.
     if task is not None and sim.of_datasets(task) is None:
         plugins.append("lerobot_env_aegis")
     return _USE[form].format(
@@ -330,11 +331,11 @@ def _use(
 
 
 def _probe_command(repo: str, recipe: Recipe | RobotStreamRecipe) -> str:
-    """The command that asks what the run's own probe has asked; its recipe is not at hand there."""
+    """The command that repeats the run's own probe without its recipe."""
     probe = recipe.probe.of_each_set()[0]
-    # Nobody else has this machine's folders: of a path, only the last part is said.
+    # Nobody else has this machine's folders, so only the last part of a path is shown.
     words = [*map(without_folders, (recipe.backbone, *probe.asking))]
-    usual = recipes.Probe()  # what the command does by itself need not be said
+    usual = recipes.Probe()  # options at their defaults are left out
     if probe.questions != usual.questions:
         words += ["--questions", str(probe.questions)]
     if probe.seed != usual.seed:
@@ -349,9 +350,9 @@ def _lerobot_command(
     looks_by: Sequence[str],
     fps: float | None,
 ) -> str:
-    """LeRobot's command that lets the policy act, in our simulation or on a robot."""
+    """LeRobot's command that runs the policy, in our simulation or on a robot."""
     if task is None:
-        rate = "" if fps is None else f" --fps={fps:g}"  # LeRobot takes 30 unless it is told
+        rate = "" if fps is None else f" --fps={fps:g}"  # LeRobot's default is 30
         return (
             f"lerobot-rollout --strategy.type=base --policy.path={repo} --robot.type=ROBOT "
             f"--task=INSTRUCTION{rate}"
@@ -361,16 +362,16 @@ def _lerobot_command(
     if len(cameras) > 1:
         return f"# lerobot-eval cannot: our tasks have one camera there, the policy {len(cameras)}"
     command = f"lerobot-eval --policy.path={repo} --env.type=aegis --env.task={task}"
-    own = sim.cameras(task)[0]  # which LeRobot's environment shows without being asked
+    own = sim.cameras(task)[0]  # the default of LeRobot's environment
     named = [name.removeprefix(lerobot_folder.IMAGES) for name in cameras] or [own]
-    if looks_by and named != [*looks_by]:  # another name would be what the own camera is called
+    if looks_by and named != [*looks_by]:  # another name would rename the task's own camera
         names = {lerobot_folder.picture_key(looks_by[0]): lerobot_folder.picture_key(named[0])}
         return f"{command} --env.camera={looks_by[0]} --rename_map={shlex.quote(json.dumps(names))}"
     return command if named == [own] else f"{command} --env.camera={shlex.quote(named[0])}"
 
 
 def _libero_command(repo: str, task: str, cameras: Sequence[str], looks_by: Sequence[str]) -> str:
-    """LeRobot's command for its own environment of LIBERO, whose cameras are image and image2."""
+    """LeRobot's command for its own LIBERO environment, whose cameras are image and image2."""
     places = [libero_table.place(member) for member in sim.members(task)]
     suites = ",".join(dict.fromkeys(f"libero_{suite}" for suite, _ in places))
     command = f"lerobot-eval --policy.path={repo} --env.type=libero --env.task={suites}"
@@ -384,15 +385,15 @@ def _libero_command(repo: str, task: str, cameras: Sequence[str], looks_by: Sequ
 
 
 def _measured(run: Path, at: Path) -> InspectReport:
-    """What is known of a checkpoint; results of the last one are those of its run."""
+    """What is known about a checkpoint; results of the last one are those of its run."""
     is_last = at.resolve() == checkpoint.last(run).resolve()
     found = inspection.run(run if is_last else at)
-    assert isinstance(found, InspectReport)  # a stream's run is refused before
+    assert isinstance(found, InspectReport)  # a stream's run was refused earlier
     return found
 
 
 def _front_matter(form: str, base_model: str | None, dataset: str | list[str] | None) -> str:
-    """The lines that the hub reads, with the backbone's and the demonstrations' ids there."""
+    """The lines that the hub reads, with its ids of the backbone and the demonstrations."""
     lines = [
         f"library_name: {'lerobot' if form == LEROBOT else 'aegis-vla'}",
         "pipeline_tag: robotics",
@@ -424,7 +425,7 @@ def _probe_row(result: Result, recipe: Recipe) -> str:
     figures = result.figures
     asked = question_set(result, recipe)
     drop = "not measured"
-    if figures.get("drop_points") is not None:  # a probe without --baseline knows none
+    if figures.get("drop_points") is not None:  # a probe without --baseline has none
         low, high = figures["drop_interval"]
         drop = f"{figures['drop_points']:.2f} points ({low:.2f} to {high:.2f})"
     before = figures.get("baseline_accuracy")
@@ -442,7 +443,7 @@ def _verdict(gate: bool | None, probed: tuple[Result, ...], recipe: Recipe) -> s
     """Whether the gate was passed, and what it allowed."""
     if gate is None:
         return "No gate was set."
-    # A probe may have had a limit of its own, which is not the recipe's.
+    # A probe may have had its own limit instead of the recipe's.
     limits = [found.settings.get("max_drop", recipe.probe.max_drop) for found in probed]
     limit = next((limit for limit in limits if limit is not None), None)
     allowed = "" if limit is None else f" (a drop of at most {limit:g} points)"
@@ -486,7 +487,7 @@ def _played(rollouts: Sequence[PlayedResult]) -> Iterator[str]:
     """A table of rollouts."""
     yield "| task | colours | episodes | success, with its 95 % interval |"
     yield "|---|---|---|---|"
-    # In which settings they differ, where two of them have one task and the same colours.
+    # The settings in which they differ, if two have the same task and colours.
     apart = told_apart([result.played for result in rollouts])
     for result, otherwise in zip(rollouts, apart, strict=True):
         figures = result.figures
@@ -499,18 +500,18 @@ def _played(rollouts: Sequence[PlayedResult]) -> Iterator[str]:
 
 
 def _success(figures: Mapping[str, Any]) -> str:
-    """A rollout's success, or its mean return on a task that is measured by it."""
+    """A rollout's success rate, or its mean return if the task is measured by returns."""
     if figures.get("success") is not None:
         return _share(figures["success"], figures["interval"])
     said, interval = f"mean return {figures['mean_return']:.4g}", figures.get("return_interval")
-    if interval is not None:  # of a single episode there is none
+    if interval is not None:  # a single episode has none
         said += f" ({interval[0]:.4g} to {interval[1]:.4g})"
     share = figures.get("return_share")
     return said if share is None else f"{said}, {_percent(share)} of the highest there is"
 
 
 def _share(share: float, interval: tuple[float, float]) -> str:
-    """A share of 1 with its interval, in percent."""
+    """A share in [0, 1] with its interval, in percent."""
     return f"{_percent(share)} ({100 * interval[0]:.1f} to {100 * interval[1]:.1f})"
 
 
@@ -519,9 +520,9 @@ def _percent(share: float) -> str:
 
 
 def _inputs(at: Path, recipe: Recipe) -> list[tuple[str, str]]:
-    """sha256 of what the policy was made from, by a name for it.
+    """Name and sha256 of each input that the policy was made from.
 
-    The anchor is left out where one was given to a method that reads none.
+    An anchor is left out if the method does not read one.
     """
     named = artifacts.read_header(at / checkpoint.EXPERT).inputs.items()
     reads = recipe.reads_anchor(recipe.train.method)

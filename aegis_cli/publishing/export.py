@@ -1,6 +1,7 @@
-"""`aegis export`: a trained policy as others use it, its weights in the type that they came in.
+"""`aegis export`: write a trained policy for others, with weights in their original dtype.
 
-A checkpoint has float32, to train on. A model that came in bfloat16 goes out in bfloat16 again.
+A checkpoint has float32, for further training. A model that came in bfloat16 is exported in
+bfloat16.
 """
 
 from __future__ import annotations
@@ -35,19 +36,19 @@ from aegis_cli.training import folder as run_folder
 from aegis_cli.training.card import without_places
 
 RECIPE = "recipe-of-training.yaml"  # `recipe.yaml` would make the folder a run without its log
-SOURCE = "source"  # the type that the backbone was stored in before it was trained
+SOURCE = "source"  # the dtype in which the backbone was stored before training
 
 
 @dataclass(frozen=True)
 class ExportReport:
-    """What was written, and how others name what the policy takes.
+    """What was written, and the names of the policy's inputs.
 
     Attributes:
-        pictures: LeRobot's names of them; empty in another layout.
-        dtype: name of the type that the backbone's weights are in.
-        rounded: whether they have lost digits by it.
-        steps: after which of its run the policy was; None where it has been taken out of one, as
-            `planned_steps` is then, which the run's recipe asks for.
+        pictures: LeRobot's names of the images; empty in another layout.
+        dtype: name of the dtype of the backbone's weights.
+        rounded: whether rounding to it lost precision.
+        steps: the policy's training steps, and planned_steps: those of the run's recipe; both None
+            for a checkpoint outside a run.
     """
 
     out: str
@@ -77,29 +78,29 @@ def run(
     on_event: OnEvent = ignore,
     task: str | None = None,
 ) -> ExportReport:
-    """Write a run's policy, or that of a checkpoint, as a folder for others.
+    """Write the policy of a run or a checkpoint as a folder for others.
 
-    Its model card is written too, and in our own layout the recipe, except for a checkpoint that
-    has been taken out of its run.
+    Its model card is written too, and in our own layout the recipe, except for a checkpoint outside
+    a run.
 
     Args:
-        out: a new folder; nothing is left of it where the export fails.
+        out: a new folder; if the export fails, nothing of it is left.
         form: the layout, LeRobot's or that of our checkpoints.
-        camera: what LeRobot calls the picture of a policy with a single camera; None: as in
-            training, `top` where it had no name.
+        camera: LeRobot's name of the image, for a policy with a single camera; None: as in
+            training, or `top` if it had no name.
         repo: where others will find the policy, for the card.
-        dtype: of the backbone's weights, SOURCE or one of `STORED_TYPES`.
-        task: whose policy, of a stream of robot tasks.
+        dtype: dtype of the backbone's weights, SOURCE or one of `STORED_TYPES`.
+        task: the task of a stream of robot tasks whose policy is written.
 
     Raises:
-        AegisError: no policy, a task of a stream that is none of plain weights, a folder that is
-            there already, a camera's name where none is to be given, or a type that the backbone
+        AegisError: no policy, a stream's task whose policy is not plain weights, a folder that
+            already exists, a camera's name where none can be given, or a dtype that the backbone
             cannot have.
     """
-    # All that can be refused by looking is, before a model of gigabytes is loaded.
+    # Everything that can be refused without loading gigabytes is refused first.
     of_stream = recipes.is_robot_stream_run(run_path)
     number = plain.check(run_path, task) if of_stream else None
-    if os.path.lexists(out):  # a link that leads nowhere too
+    if os.path.lexists(out):  # also a broken link
         raise AegisError(f"'{out}' is there already", "a new folder", "choose another --out")
     check_utf8(out, "choose another --out")
     if camera is not None and form != card.LEROBOT:
@@ -120,12 +121,12 @@ def run(
     else:
         steps = planned = loaded.stream.train.steps
     meta, rounded = _rounded(policy.backbone, meta, dtype)
-    if "merge" in meta:  # which models it was between, without where they lie here
+    if "merge" in meta:  # names of the merged models, without local paths
         meta["merge"] = without_places(meta["merge"])
     cameras = _cameras(camera, meta)
     if camera is not None:
         meta = _renamed(meta, camera)
-    # Written beside it under another name, so that an export that fails leaves nothing.
+    # Written under a temporary name beside it, so that a failed export leaves nothing.
     make_folder(out.parent)
     with checkpoint.writing(out), folder_aside(out) as aside:
         if form == card.LEROBOT:
@@ -160,8 +161,8 @@ class _Loaded(NamedTuple):
     """A policy to be written.
 
     Attributes:
-        stream: the recipe of the stream that it is of; None of the run of one policy.
-        task: whose policy it is, of a stream.
+        stream: the recipe of its stream; None for the run of one policy.
+        task: the policy's task in a stream.
     """
 
     policy: Policy
@@ -171,7 +172,7 @@ class _Loaded(NamedTuple):
 
     @classmethod
     def of(cls, run: Path, number: int | None) -> _Loaded:
-        """The policy of a run, or of the task of that number of a stream's."""
+        """The policy of a run, or of the numbered task of a stream's run."""
         if number is None:
             return cls(*checkpoint.load_policy(run))
         stream = robots.load_to_act(run)
@@ -182,13 +183,13 @@ class _Loaded(NamedTuple):
 def warn_of_steps_left(
     run: Path, stage: str, on_event: OnEvent
 ) -> tuple[int, int] | tuple[None, None]:
-    """Say so where the last policy of a run that is not finished is given to others.
+    """Warn if the last policy of an unfinished run is given to others.
 
-    An earlier checkpoint that a user names is what the user wants.
+    For an earlier checkpoint there is no warning, since the user has named it.
 
     Returns:
-        The steps that the policy has behind it, and those that its run's recipe asks for; None for
-        each of a policy outside of its run.
+        The policy's training steps, and those that its run's recipe asks for; None for both if the
+        policy is outside a run.
     """
     if lerobot_folder.is_policy(run):
         return None, None
@@ -200,16 +201,16 @@ def warn_of_steps_left(
     if steps < planned and at.resolve() == checkpoint.last(home).resolve():
         taken = steps_taken(steps, planned)
         text = f"'{home}' is not finished: {taken} steps"
-        if (at / checkpoint.STATE).is_file():  # one that was merged has none
+        if (at / checkpoint.STATE).is_file():  # a merged one has no state
             text += f"; {commands.aegis('train', home)} goes on"
         on_event(Warned(stage, text))
     return steps, planned
 
 
 def warn_of_a_merge(run: Path, stage: str, on_event: OnEvent) -> None:
-    """Say so where `aegis run` has merged a run, of which the weights before are given to others.
+    """Warn if `aegis run` has merged a run, but the weights before the merge are given to others.
 
-    What was measured is what it was merged into.
+    The measured weights are the merged ones.
     """
     if lerobot_folder.is_policy(run):
         return
@@ -221,12 +222,12 @@ def warn_of_a_merge(run: Path, stage: str, on_event: OnEvent) -> None:
 
 
 def _cameras(camera: str | None, meta: PolicyMeta) -> list[str]:
-    """What LeRobot calls the pictures: the policy's own names, or for a single camera `camera`.
+    """LeRobot's names of the images: the policy's own names, or `camera` for a single camera.
 
     Raises:
-        AegisError: a name where the policy has several cameras, or one that no feature can have.
+        AegisError: a name for a policy with several cameras, or one that no feature can have.
     """
-    # Without a name of its own the only picture has the one that LeRobot's folder gives it.
+    # Without a name of its own, the only image gets the default of LeRobot's layout.
     named = list(meta.get("cameras", ())) or [lerobot_folder.CAMERA]
     if camera is None:
         return named
@@ -246,19 +247,19 @@ def _cameras(camera: str | None, meta: PolicyMeta) -> list[str]:
 
 
 def _renamed(meta: PolicyMeta, camera: str) -> PolicyMeta:
-    """What a user has to know of a policy of one camera that is called otherwise from now on.
+    """The metadata of a policy with one camera after that camera is renamed.
 
-    A simulated task, and the demonstrations, call it as they did.
+    A simulated task and the demonstrations keep their own name for it.
     """
     task = meta["task"]
     named = meta.get("cameras") or ([] if task is None else sim.cameras(task))
-    if not named:  # nobody has called it anything
+    if not named:  # it has no name yet
         return meta
     now = layout.short(named[0])
     known = meta.get("rename", {})
-    # A renaming is from the demonstrations' name to the policy's: this camera's is replaced.
+    # A renaming maps the demonstrations' name to the policy's; this camera's is replaced.
     others = {own: new for own, new in known.items() if layout.short(new) != now}
-    # Of a camera that was renamed already, the name that it had at first.
+    # If the camera was renamed before, its original name.
     first = next((layout.short(own) for own in known if own not in others), now)
     found = meta.copy()
     found["rename"] = {**others, first: layout.short(camera)}
@@ -277,15 +278,15 @@ def refuse_stream(run: Path) -> None:
 
 
 def _rounded(backbone: Backbone, meta: PolicyMeta, dtype: str) -> tuple[PolicyMeta, bool]:
-    """Round the backbone's weights to a type.
+    """Round the backbone's weights to a dtype.
 
     Returns:
-        What a user has to know, which names the type, and whether digits were lost.
+        The metadata, which names the dtype, and whether precision was lost.
 
     Raises:
         AegisError: the backbone has to be float32.
     """
-    # A checkpoint of `train.weights: bf16` has bfloat16 itself, whatever it was made from.
+    # A checkpoint of `train.weights: bf16` is in bfloat16, whatever it was made from.
     chosen = meta.get("stored", backbone.stored) if dtype == SOURCE else dtype
     now = meta.copy()
     now.pop("stored", None)
@@ -297,7 +298,7 @@ def _rounded(backbone: Backbone, meta: PolicyMeta, dtype: str) -> tuple[PolicyMe
             "a policy with a Hugging Face backbone",
             f"leave --dtype out, or give --dtype {FLOAT32}",
         )
-    # References do for the weights of before: rounding gives each parameter new ones.
+    # References to the old weights are enough, since rounding allocates new ones.
     before = [p.detach() for p in backbone.parameters()]
     backbone.round_weights(STORED_TYPES[chosen])
     after = backbone.parameters()
@@ -309,12 +310,12 @@ def _rounded(backbone: Backbone, meta: PolicyMeta, dtype: str) -> tuple[PolicyMe
 def _write_checkpoint(
     folder: Path, run: Path, policy: Policy, meta: PolicyMeta, task: str | None = None
 ) -> None:
-    """Write a policy as our checkpoints are, without what a training needs to go on.
+    """Write a policy in the layout of our checkpoints, without the training state.
 
     Args:
-        task: whose policy it is, in the run of a stream.
+        task: the policy's task in the run of a stream.
     """
-    # A folder in LeRobot's layout keeps no record of what its policy was made from.
+    # A folder in LeRobot's layout does not record what its policy was made from.
     inputs: Mapping[str, str] = {}
     seed, about = None, ""
     if task is not None:
@@ -331,19 +332,19 @@ def _write_checkpoint(
 
 
 def _pictures(cameras: Sequence[str]) -> tuple[str, ...]:
-    """LeRobot's names of the pictures; a dataset's own, such as `observation.image`, stay."""
+    """LeRobot's names of the images; a dataset's own, such as `observation.image`, are kept."""
     return tuple(lerobot_folder.picture_key(name) for name in cameras)
 
 
 def _hub_name(name: str) -> str:
-    """A folder's name as a repository of the hub may be called, for commands on the card."""
+    """A folder's name as a valid repository name on the hub, for commands on the card."""
     return re.sub(r"[^A-Za-z0-9_.]+|\.{2,}", "-", name).strip("-.") or "NAME"
 
 
 def _write_card(
     folder: Path, run: Path, form: str, repo: str, stored: card.Stored, cameras: Sequence[str]
 ) -> None:
-    """Write the model card of a run's policy; a policy without a run has nothing to say."""
+    """Write the model card of a run's policy; a policy without a run gets none."""
     if lerobot_folder.is_policy(run):
         return
     at = checkpoint.chosen(run)
@@ -354,13 +355,13 @@ def _write_card(
 
 
 def _write_texts(folder: Path, home: Path, form: str, text: str) -> None:
-    """Write a card, and in our own layout beside it the recipe of the run, which it names."""
+    """Write a card, and in our own layout the recipe of the run, to which the card refers."""
     write_text(folder / card.NAME, text)
     if form == card.AEGIS:
         write_text(folder / RECIPE, _recipe(home))
 
 
 def _recipe(home: Path) -> str:
-    """The recipe of the training, without the folders in which models and data lie here."""
+    """The recipe of the training, without local paths of models and data."""
     kept = yaml.safe_load((home / "recipe.yaml").read_text(encoding="utf-8"))
     return dump(without_places(kept))

@@ -1,7 +1,7 @@
-"""`aegis extract`: the VLM in a robot policy of another program, as a plain Hugging Face model.
+"""`aegis extract`: write the VLM of another program's policy as a plain Hugging Face model.
 
-Its configuration, tokenizer and processor are those of the model that the policy was made from, and
-so are the tensors that the policy does not have.
+Configuration, tokenizer and processor come from the model that the policy was made from, and so do
+tensors that the policy lacks.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ from aegis_cli.publishing.vlm_names import Spec
 from aegis_cli.training import checkpoint
 from aegis_cli.training.card import without_folders
 
-SOURCE = "source"  # the type that each tensor of the base is stored in
+SOURCE = "source"  # the dtype in which each tensor of the base is stored
 _COPIED = ("config.json", "generation_config.json", "aegis.json")
-_TYPE_KEYS = ("dtype", "torch_dtype")  # of transformers 5, and of those before it
+_TYPE_KEYS = ("dtype", "torch_dtype")  # in transformers 5, and in earlier releases
 _CARD = """# The VLM of `{policy}`
 
 `aegis extract` has taken it out of the robot policy: {taken} of its {tensors} tensors are the
@@ -49,7 +49,7 @@ processor are that model's.
 
 @dataclass(frozen=True)
 class Share:
-    """Tensors of which one thing is to be said."""
+    """A group of tensors that the report describes together."""
 
     what: str
     why: str
@@ -59,18 +59,18 @@ class Share:
 
 @dataclass(frozen=True)
 class ExtractReport:
-    """What was taken out, and what was not.
+    """What was extracted, and what was not.
 
     Attributes:
-        type: what LeRobot calls the policy; None of another program's.
-        prefix: what the policy's names have before the VLM's.
-        dtype: the types that the weights are stored in.
-        tensors, parameters: of the VLM, of which `taken` are the policy's.
-        moved: of those that were taken, how many differ from the base's by more than the rounding
-            of the type that the policy stores them in.
-        rounded: of those that were taken, how many have lost digits.
-        kept: what is the base's.
-        more: the policy's names under the prefix which the base has not.
+        type: LeRobot's name of the policy's type; None for another program's policy.
+        prefix: the prefix of the VLM's names in the policy.
+        dtype: the dtypes in which the weights are stored.
+        tensors, parameters: the VLM's, of which `taken` come from the policy.
+        moved: how many of those that were taken differ from the base's by more than rounding to the
+            dtype in which the policy stores them.
+        rounded: how many of those that were taken lost precision.
+        kept: the tensors that come from the base.
+        more: the policy's names under the prefix that the base does not have.
     """
 
     out: str
@@ -96,17 +96,17 @@ class ExtractReport:
 def run(
     policy: str, base: str, out: Path, dtype: str = SOURCE, on_event: OnEvent = ignore
 ) -> ExtractReport:
-    """Write the VLM of a policy as a folder that everything takes which takes a backbone.
+    """Write the VLM of a policy as a folder that can be used wherever a backbone can.
 
     Args:
         policy: a folder, a file or a hub id of safetensors.
         base: the VLM that the policy was made from.
-        out: a new folder; nothing is left of it where this fails.
-        dtype: of the weights, SOURCE or one of `STORED_TYPES`.
+        out: a new folder; if this fails, nothing of it is left.
+        dtype: dtype of the weights, SOURCE or one of `STORED_TYPES`.
 
     Raises:
-        AegisError: a policy of Aegis, or none; a base that is no VLM, or not the policy's; or a
-            folder that is there already.
+        AegisError: a policy of Aegis, or no policy; a base that is not a VLM, or not the policy's;
+            or a folder that already exists.
     """
     check_new(out)
     with foreign_policy.opened(policy, base) as pair:
@@ -124,14 +124,14 @@ def run(
 
 
 def check_new(out: Path) -> None:
-    """Raise AegisError where something is at a path already."""
-    if os.path.lexists(out):  # a link that leads nowhere too
+    """Raise AegisError if a path already exists."""
+    if os.path.lexists(out):  # also a broken link
         raise AegisError(f"'{out}' is there already", "a new folder", "choose another --out")
     check_utf8(out, "choose another --out")
 
 
 class _Counted:
-    """Rows of the VLM's tensors, the policy's where it has them, and what is seen of them."""
+    """Rows of the VLM's tensors, from the policy if it has them, and counts of what changed."""
 
     def __init__(self, pair: Pair, types: Mapping[str, str], called: tuple[str, str]) -> None:
         self._pair, self._types, self._called = pair, types, called
@@ -139,7 +139,7 @@ class _Counted:
         self.rounded: set[str] = set()
 
     def rows(self, name: str, first: int, last: int) -> Tensor:
-        """Rows of a tensor of the base's name, as they are to be written."""
+        """Rows to write for a tensor, by the base's name."""
         pair, dtype = self._pair, TYPES.get(self._types[name])
         before = pair.vlm.rows(name, first, last)
         if name not in pair.match.taken:
@@ -162,10 +162,10 @@ class _Counted:
 
 
 def checked_cast(own: Tensor, dtype: torch.dtype, name: str, called: str) -> Tensor:
-    """A tensor in another type.
+    """A tensor in another dtype.
 
     Raises:
-        AegisError: numbers that are not finite, before or by it.
+        AegisError: numbers that are not finite, before or after the conversion.
     """
     written = own.to(dtype)
     if written.isfinite().all():
@@ -185,7 +185,7 @@ def checked_cast(own: Tensor, dtype: torch.dtype, name: str, called: str) -> Ten
 
 
 def _types(pair: Pair, dtype: str) -> dict[str, str]:
-    """safetensors' name of the type that each tensor is to be written in."""
+    """safetensors' name of the dtype in which each tensor is written."""
     wanted = NAMES.get(dtype)
     return {
         name: wanted if wanted is not None and spec.is_float else spec.dtype
@@ -200,7 +200,7 @@ def _write_weights(
     counted: _Counted,
     on_event: OnEvent,
 ) -> None:
-    """Write files of the base's names, and their index, if they have one."""
+    """Write files with the base's file names, and their index, if there is one."""
     rows = told(counted.rows, "extract", len(pair.vlm.specs), on_event)
     size = 0
     for part in pair.vlm.parts:
@@ -218,7 +218,7 @@ def _write_weights(
 def told(
     rows: Callable[[str, int, int], Tensor], stage: str, total: int, on_event: OnEvent
 ) -> Callable[[str, int, int], Tensor]:
-    """The same rows, with an event for each tensor that they begin."""
+    """The same rows, with a progress event at the first rows of each tensor."""
     done = 0
     on_event(Progress(stage, 0, total, "tensors"))
 
@@ -234,7 +234,7 @@ def told(
 
 
 def _copy_records(folder: Path, pair: Pair, dtype: str | None) -> None:
-    """Copy what the base has beside its weights; its configuration names the type of these."""
+    """Copy the base's other files; the copied configuration names the dtype of the weights."""
     for name, content in model_folder.processor_files(pair.vlm_at).items():
         (folder / name).parent.mkdir(exist_ok=True)
         (folder / name).write_bytes(content)
@@ -292,14 +292,14 @@ def _report(
 
 
 def _more(pair: Pair) -> tuple[str, ...]:
-    """What the policy has of a VLM, and the base has not."""
+    """Names of tensors and rows of the policy's VLM that the base does not have."""
     found, own = pair.match, pair.policy
     more = list(found.more)
     for name, rows in found.rows.items():
         other = found.taken[name]
         if rows < own.specs[other].shape[0]:
             more.append(f"{other} (rows {rows:,} to {own.specs[other].shape[0] - 1:,})")
-    # The base has one tensor for both. Where they are equal there is nothing to say.
+    # The base has one tensor for both; if the policy's two are equal, nothing is missing.
     if found.second is not None and not tensor_files.equal(own, *found.second):
         more.append(f"{found.second[0]} (which the base ties to {found.second[1]})")
     return tuple(more)
@@ -321,7 +321,7 @@ def _card(report: ExtractReport) -> str:
 
 
 def _warn(report: ExtractReport, pair: Pair, on_event: OnEvent) -> None:
-    """Say what a probe would not show by itself."""
+    """Warn of what a probe would not show."""
     if report.rounded:
         on_event(
             Warned(

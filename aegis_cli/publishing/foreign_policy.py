@@ -1,4 +1,4 @@
-"""A robot policy that another program trained, and the VLM that it was made from, on this disk."""
+"""Open a robot policy that another program trained, and the VLM that it was made from."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from aegis_cli.publishing.vlm_names import Match
 from aegis_cli.training import checkpoint
 
 _EXPECTED = "a policy's weights as safetensors: LeRobot's pretrained_model folder, or openpi's"
-_INSIDE = ("pretrained_model", "checkpoints/last/pretrained_model")  # of LeRobot's trainings
+_INSIDE = ("pretrained_model", "checkpoints/last/pretrained_model")  # in LeRobot's output folders
 _OTHER_WEIGHTS = (".bin", ".pt", ".pth", ".ckpt")
 
 
@@ -29,7 +29,7 @@ class Pair:
     Attributes:
         policy_at: the policy's folder, or its file.
         vlm_at: the VLM's folder.
-        layers: where a user says that the VLM's language layers are; None: nowhere.
+        layers: the path of the VLM's language layers, if the user gave one.
     """
 
     policy: Tensors
@@ -76,7 +76,7 @@ def locate(name: str) -> Path:
     """The folder or file of a policy, downloaded if it is an id on the hub.
 
     Raises:
-        AegisError: neither here nor to be had.
+        AegisError: neither here nor downloadable.
     """
     path = Path(name)
     if path.exists():
@@ -102,7 +102,7 @@ def _weights(at: Path, name: str) -> Sequence[Path]:
     """The files of a policy's weights.
 
     Raises:
-        AegisError: a policy of ours, an adapter, or no weights of safetensors.
+        AegisError: a policy of ours, an adapter, or no weights in safetensors.
     """
     files.refuse_special(at)
     if at.is_file():
@@ -141,10 +141,10 @@ def _of_ours(name: str) -> AegisError:
 
 
 def _vlm(name: str) -> tuple[Path, str | None]:
-    """The folder of a Hugging Face VLM, and where its layers are said to be.
+    """The folder of a Hugging Face VLM, and the path of its layers, if the name has one.
 
     Raises:
-        AegisError: none, or another model.
+        AegisError: no model, or another kind of model.
     """
     path = backbones.locate(name)
     if not path.is_dir():

@@ -1,4 +1,4 @@
-"""`aegis insert`: a VLM back into the robot policy of another program that it was taken out of."""
+"""`aegis insert`: put a VLM back into another program's policy, from which it was extracted."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from aegis_cli.publishing.foreign_policy import Pair
 from aegis_cli.publishing.tensor_files import TYPES
 from aegis_cli.training import checkpoint
 
-_NOT_COPIED = (".git", ".cache")  # of a copy of a repository, and what a download leaves
+_NOT_COPIED = (".git", ".cache")  # from a clone of a repository, and from a download
 
 
 @dataclass(frozen=True)
@@ -27,11 +27,11 @@ class InsertReport:
     """What was put into the policy.
 
     Attributes:
-        prefix: what the policy's names have before the VLM's.
-        tensors, parameters: of the policy, of which `put` are the VLM's now.
-        changed: of those that were put in, how many differ from what the policy had.
-        rounded: of those that were put in, how many have lost digits.
-        left_out: what the VLM has, and the policy has not.
+        prefix: the prefix of the VLM's names in the policy.
+        tensors, parameters: the policy's, of which `put` now come from the VLM.
+        changed: how many of those that were put in differ from what the policy had.
+        rounded: how many of those that were put in lost precision.
+        left_out: what the VLM has and the policy does not.
     """
 
     out: str
@@ -51,15 +51,15 @@ class InsertReport:
 
 
 def run(vlm: str, policy: str, out: Path, on_event: OnEvent = ignore) -> InsertReport:
-    """Write a policy's folder again, with the tensors of a VLM in place of its own VLM's.
+    """Write a copy of a policy's folder, with the tensors of a VLM in place of its own VLM's.
 
-    They are written in the types and under the names that the policy has. Where the type holds all
-    digits, what `aegis extract` took out of a policy gives the same files again.
+    They are written with the policy's dtypes and names. Unless extraction lost precision, inserting
+    an unchanged VLM from `aegis extract` gives the same files again.
 
     Args:
-        vlm: a Hugging Face model, such as what `aegis merge` made of an extracted one.
+        vlm: a Hugging Face model, such as an extracted one after `aegis merge`.
         policy: a folder or a hub id.
-        out: a new folder; nothing is left of it where this fails.
+        out: a new folder; if this fails, nothing of it is left.
 
     Raises:
         AegisError: as `aegis extract` does, or a policy that is a file.
@@ -91,7 +91,7 @@ def run(vlm: str, policy: str, out: Path, on_event: OnEvent = ignore) -> InsertR
 
 
 class _Rows:
-    """Rows of the policy's tensors, the VLM's where they are of it, and what is seen of them."""
+    """Rows of the policy's tensors, from the VLM if they belong to it, and counts of changes."""
 
     def __init__(self, pair: Pair, called: str) -> None:
         self._pair, self._called = pair, called
@@ -100,7 +100,7 @@ class _Rows:
         self.rounded: set[str] = set()
 
     def rows(self, name: str, first: int, last: int) -> Tensor:
-        """Rows of a tensor of the policy's name, as they are to be written."""
+        """Rows to write for a tensor, by the policy's name."""
         pair = self._pair
         before = pair.policy.rows(name, first, last)
         source = self.source.get(name)
@@ -120,18 +120,18 @@ class _Rows:
 
 def _sources(pair: Pair) -> dict[str, str]:
     """The policy's name of each tensor that the VLM has -> the VLM's name."""
-    # A table and a head that are one in the policy are alike in the VLM.
+    # If table and head are one tensor in the policy, they are equal in the VLM.
     found = {other: name for name, other in pair.match.taken.items()}
     if pair.match.second is not None:
         second, first = pair.match.second
-        # A head that has learned by itself stays: the VLM has none.
+        # A separately trained head stays, since the VLM has none.
         if tensor_files.equal(pair.policy, second, first):
             found[second] = found[first]
     return found
 
 
 def _copy(pair: Pair, folder: Path) -> None:
-    """Copy all that the policy's folder holds beside its weights."""
+    """Copy everything in the policy's folder except its weights."""
     weights = {part.path for part in pair.policy.parts}
 
     def left_out(at: str, names: list[str]) -> list[str]:

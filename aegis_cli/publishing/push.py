@@ -1,6 +1,6 @@
-"""`aegis push`: a trained policy with its model card, as a model repository of the hub.
+"""`aegis push`: upload a trained policy with its model card as a model repository of the hub.
 
-What `aegis export` has written, its card edited or not, is sent as it is.
+An export of `aegis export` is sent as it is, whether or not its card was edited.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from huggingface_hub import HfApi
 
 _REPO = re.compile(r"(?![-.])[\w.-]+(?<![-.])/(?![-.])[\w.-]+(?<![-.])", re.ASCII)
-# What lies in `backbone/` after a push: the model's files and its card, and what transformers calls
-# the files of a processor. One of another backbone would be loaded together with the new one.
+# Files in `backbone/` after a push: the model's files and its card, and transformers' names for the
+# files of a processor. A leftover file of another backbone would be loaded with the new one.
 _OF_BACKBONE = {
     "README.md",
     "config.json",
@@ -55,8 +55,8 @@ _OF_BACKBONE = {
     "sentencepiece.model",
     "sentencepiece.bpe.model",
 }
-_TEMPLATES = "additional_chat_templates"  # the only folder of a processor's
-_NOBODYS = re.compile(r"\bORG/[\w-]+(?:\.[\w-]+)*")  # what an export's card calls the repository
+_TEMPLATES = "additional_chat_templates"  # a processor's only subfolder
+_NOBODYS = re.compile(r"\bORG/[\w-]+(?:\.[\w-]+)*")  # the repository's placeholder on a card
 _LONGEST = 96  # characters of a repository's name, by the hub's rules
 _NO_TOKEN = "hf auth login, or set HF_TOKEN to one of https://huggingface.co/settings/tokens"
 
@@ -67,11 +67,10 @@ class PushReport:
 
     Attributes:
         format: `aegis`, a checkpoint without its training state, or `lerobot`.
-        dtype: name of the type that the backbone's weights are in.
-        url: of the commit; None where nothing was sent.
+        dtype: name of the dtype of the backbone's weights.
+        url: the commit's; None if nothing was sent.
         files: their paths in the repository.
-        removed: paths of a policy of ours that was there before, which the new one lacks; not
-            known of a dry run.
+        removed: paths of an earlier policy of ours that the new one lacks; not known for a dry run.
         megabytes: the sizes of `files` together.
     """
 
@@ -99,20 +98,20 @@ def run(
 ) -> PushReport:
     """Send the policy of a run, of a checkpoint in a run, or of an export to the hub in one commit.
 
-    A repository that is not there is created. Of its other files those go that an earlier push has
-    left, in either layout or with another backbone, which would be loaded instead of the new policy
-    or with it; all others stay.
+    A missing repository is created. Files that an earlier push has left, in either layout or with
+    another backbone, are removed, since they would be loaded instead of the new policy or with it;
+    all other files stay.
 
     Args:
         repo: ORG/NAME.
-        form: `aegis`, which None is for a run, or `lerobot`; an export has its own.
+        form: `aegis` or `lerobot`; None: `aegis` for a run, and an export's own layout.
         private: create a private repository, and refuse one that is public.
         dry_run: check everything that needs no network, and send nothing.
-        dtype: of the backbone's weights, as `export.run` takes it.
+        dtype: dtype of the backbone's weights, as for `export.run`.
 
     Raises:
-        AegisError: no run of a policy and no export, a damaged one, no such name, no token, or a
-            hub that cannot be reached or refuses.
+        AegisError: neither a run of a policy nor an export, a damaged one, an invalid name, no
+            token, or a hub that cannot be reached or refuses.
     """
     _check_name(repo)
     export.refuse_stream(run_path)
@@ -123,7 +122,7 @@ def run(
         _check_in_a_run(run_path, repo)
         export.warn_of_steps_left(run_path, "push", on_event)
         export.warn_of_a_merge(run_path, "push", on_event)
-    # Before the export, which takes minutes: without a token nothing could be sent.
+    # Before the export, which takes minutes, since nothing can be sent without a token.
     api = None if dry_run else _api()
     with tempfile.TemporaryDirectory() as aside:
         form, folder = form or card.AEGIS, Path(aside) / "policy"
@@ -143,7 +142,7 @@ def run(
 
 
 def _is_exported(folder: Path) -> bool:
-    """Whether a folder is what `aegis export` makes of a run: a policy with its card."""
+    """Whether a folder is a run's export by `aegis export`: a policy with its card."""
     if not (folder / card.NAME).is_file():
         return False
     if lerobot_folder.is_policy(folder):
@@ -157,7 +156,7 @@ def _own_form(folder: Path, form: str | None, dtype: str) -> str:
     """The layout of an exported folder.
 
     Raises:
-        AegisError: another one is asked for, or another type of weights.
+        AegisError: another layout or another dtype of weights is requested.
     """
     own = card.LEROBOT if lerobot_folder.is_policy(folder) else card.AEGIS
     asked = f"--dtype {dtype}" if dtype != export.SOURCE else ""
@@ -173,7 +172,7 @@ def _own_form(folder: Path, form: str | None, dtype: str) -> str:
 
 
 def _check_in_a_run(path: Path, repo: str) -> None:
-    """Raise AegisError for a policy of which nothing makes a model card."""
+    """Raise AegisError for a policy outside a run, for which no model card can be made."""
     if lerobot_folder.is_policy(path) or checkpoint.run_of(checkpoint.chosen(path)) is None:
         raise AegisError(
             f"'{path}', a policy outside of its run and without {card.NAME}",
@@ -184,13 +183,13 @@ def _check_in_a_run(path: Path, repo: str) -> None:
 
 
 def _as_it_is(folder: Path, repo: str, aside: Path) -> tuple[dict[str, Path], str]:
-    """The files of an exported folder, and the type of its backbone's weights.
+    """The files of an exported folder, and the dtype of its backbone's weights.
 
     Args:
-        aside: a folder to make, for the card, whose commands get the repository's name.
+        aside: a folder to create for the card, in whose commands the repository's name is filled.
 
     Raises:
-        AegisError: a policy that is damaged, or a card that is no text.
+        AegisError: a damaged policy, or a card that is not text.
     """
     meta, own = checkpoint.load_policy(folder)[1], folder / card.NAME
     try:
@@ -214,7 +213,7 @@ def _check_name(repo: str) -> None:
 
 
 def _files(folder: Path) -> dict[str, Path]:
-    """The files below a folder by their paths in it, but for hidden ones, such as of git."""
+    """The files below a folder by their relative paths, except hidden ones such as git's."""
     found = {}
     for path in folder.rglob("*"):
         own = path.relative_to(folder)
@@ -246,18 +245,18 @@ def _api() -> HfApi:
 def _send(
     api: HfApi, repo: str, contents: Mapping[str, Path], private: bool
 ) -> tuple[str, tuple[str, ...]]:
-    """Create the repository where it is missing, and commit the files.
+    """Create the repository if it is missing, and commit the files.
 
     Returns:
-        Where the commit can be seen, and which files it removes.
+        The commit's URL, and which files it removes.
     """
     from huggingface_hub import CommitOperationAdd, CommitOperationDelete
 
     added = [CommitOperationAdd(path, content) for path, content in sorted(contents.items())]
     with _reaching(repo):
-        # None leaves it to the organisation, which may want all of its repositories private.
+        # None leaves the choice to the organisation, which may make all repositories private.
         api.create_repo(repo, private=private or None, exist_ok=True)
-        # `exist_ok` takes a public one for the repository that was asked for.
+        # `exist_ok` also accepts an existing public repository.
         if private and not api.repo_info(repo).private:
             raise AegisError(
                 f"--private for '{repo}', which is there and public",
@@ -266,19 +265,19 @@ def _send(
             )
         removed = _of_an_earlier_push(api, repo, contents)
         changes = [*added, *(CommitOperationDelete(path) for path in removed)]
-        # One commit: nobody ever loads the new policy beside a part of the old one.
+        # One commit, so that nobody can load the new policy with a part of the old one.
         message = f"A policy of Aegis {__version__}"
         commit = api.create_commit(repo, changes, commit_message=message)
     return commit.commit_url, removed
 
 
 def _of_an_earlier_push(api: HfApi, repo: str, contents: Mapping[str, Path]) -> tuple[str, ...]:
-    """The files that an earlier push, in either layout, has left and that this one lacks."""
+    """The files of an earlier push, in either layout, that this one lacks."""
     siblings = api.model_info(repo).siblings or []
     there = {file.rfilename for file in siblings}
     left = set[str]()
     if {lerobot_folder.CONFIG, lerobot_folder.MODEL} <= there:
-        # Other policies and models have files of these names.
+        # Other policies and models also have files with these names.
         config = Path(api.hf_hub_download(repo, lerobot_folder.CONFIG))
         if lerobot_folder.is_own_config(config.read_bytes()):
             left |= {lerobot_folder.CONFIG, lerobot_folder.MODEL}
@@ -291,7 +290,7 @@ def _of_an_earlier_push(api: HfApi, repo: str, contents: Mapping[str, Path]) -> 
 
 
 def _is_of_a_backbone(path: str) -> bool:
-    """Whether our own writing gives files this path, below the folder of a policy's backbone."""
+    """Whether this is a path that Aegis writes in the folder of a policy's backbone."""
     folder, _, name = path.partition("/")
     if folder != checkpoint.BACKBONE:
         return False
@@ -303,7 +302,7 @@ def _is_of_a_backbone(path: str) -> bool:
 
 @contextlib.contextmanager
 def _reaching(repo: str) -> Generator[None]:
-    """What the hub or the network refuses, as the one error that a user sees."""
+    """Turn errors of the hub or the network into the one error that a user sees."""
     from huggingface_hub.errors import HfHubHTTPError, HTTPError, OfflineModeIsEnabled
 
     try:
@@ -313,11 +312,11 @@ def _reaching(repo: str) -> Generator[None]:
         raise AegisError("HF_HUB_OFFLINE, which forbids the network", "a network", fix) from error
     except HfHubHTTPError as error:
         raise _refused(repo, error) from error
-    except ValueError as error:  # of the card's head, which the client has the hub check at first
+    except ValueError as error:  # from the card's head, which the hub checks first
         found = " ".join(str(error).split())
         fix = f"correct what stands between the lines --- of {card.NAME}; nothing was committed"
         raise AegisError(found, "a model card whose head is sound YAML", fix) from error
-    except (HTTPError, OSError) as error:  # of the connection, or a time-out
+    except (HTTPError, OSError) as error:  # a failed connection or a timeout
         said = str(error) or type(error).__name__
         raise AegisError(
             f"the hub cannot be reached: {said.splitlines()[0]}",
@@ -327,10 +326,10 @@ def _reaching(repo: str) -> Generator[None]:
 
 
 def _refused(repo: str, error: Any) -> AegisError:
-    """The error for an answer of the hub that is no success."""
+    """The error for an unsuccessful response of the hub."""
     status = error.response.status_code
     said = (getattr(error, "server_message", None) or str(error)).strip().splitlines()[0]
-    # The hub answers 404 to whoever may not see a repository.
+    # The hub answers 404 to users who may not see a repository.
     found = f"the hub refuses '{repo}' ({status}): {said}"
     if status == 401:
         return AegisError(found, "a token that is valid", _NO_TOKEN)

@@ -1,4 +1,4 @@
-"""safetensors files read and written some rows of a tensor at a time, never a model as a whole."""
+"""Read and write safetensors files a few rows at a time, without ever loading a whole model."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ TYPES = {
     "BF16": torch.bfloat16,
 }
 NAMES = {str(dtype).removeprefix("torch."): name for name, dtype in TYPES.items()}
-# Whole numbers, as of buffers. Of any other type, which is copied and nothing else, the bytes do.
+# Integer types, as in buffers. Any other type is only copied, as bytes.
 _WHOLE = {
     "I64": torch.int64,
     "I32": torch.int32,
@@ -33,20 +33,20 @@ _WHOLE = {
     "I8": torch.int8,
     "BOOL": torch.bool,
 }
-_AT_ONCE = 2**26  # bytes of a tensor that are in memory
+_AT_ONCE = 2**26  # bytes of a tensor that are in memory at once
 _INDEX = "*.safetensors.index.json"
 _ONE = "model.safetensors"
 
 
 @dataclass(frozen=True)
 class TensorFile:
-    """What the header of one file says.
+    """The contents of one file's header.
 
     Attributes:
-        head: the header as it stands in the file, with its length before it.
-        specs: its tensors, in the order in which they lie in the file.
-        offsets: where each of them begins and ends, from the end of the header on [bytes].
-        metadata: what else it says; None: nothing.
+        head: the raw header, with its length before it.
+        specs: the tensors, in the order of their data in the file.
+        offsets: where each of them begins and ends, counted from the end of the header [bytes].
+        metadata: the header's metadata; None if there is none.
     """
 
     path: Path
@@ -57,7 +57,7 @@ class TensorFile:
 
 
 class Tensors:
-    """The tensors of a model or a policy, wherever in its files they lie."""
+    """The tensors of a model or a policy, from all of its files."""
 
     def __init__(self, parts: Sequence[TensorFile], opened: Mapping[Path, BufferedReader]) -> None:
         self.parts = parts
@@ -66,12 +66,12 @@ class Tensors:
         self._files = opened
 
     def rows(self, name: str, first: int, last: int) -> Tensor:
-        """Rows of a tensor; of one without axes all of it.
+        """Rows of a tensor; a scalar is returned whole.
 
-        They are read and not mapped: what is mapped of a large model fills the memory, too.
+        They are read and not memory-mapped, since mapped pages of a large model fill memory too.
 
         Raises:
-            AegisError: the file has become shorter meanwhile.
+            AegisError: the file has become shorter since it was opened.
         """
         part, spec = self._parts[name], self.specs[name]
         start, end = part.offsets[name]
@@ -92,11 +92,11 @@ class Tensors:
 def paths(folder: Path) -> list[Path]:
     """The files of weights in a folder: those of its index, else the model's, else all.
 
-    LeRobot puts the scales of its steps before and after a policy into files beside it, and
-    Mistral's repositories have their weights twice.
+    LeRobot stores the scales of a policy's pre- and post-processing in separate files, and
+    Mistral's repositories contain their weights twice.
 
     Raises:
-        AegisError: a file that the index names is not there.
+        AegisError: a file that the index names is missing.
     """
     found = sorted(folder.glob(_INDEX))
     if found and not (folder / _ONE).is_file():
@@ -125,10 +125,10 @@ _AGAIN = "download it again"
 
 @contextlib.contextmanager
 def opened(parts: Sequence[Path]) -> Generator[Tensors]:
-    """The tensors of these files, which stay open meanwhile.
+    """The tensors of these files, which stay open inside the block.
 
     Raises:
-        AegisError: a file that is missing, damaged or none of safetensors, or two that have a
+        AegisError: a file that is missing, damaged or not in safetensors, or two files with a
             tensor of the same name.
     """
     with contextlib.ExitStack() as stack:
@@ -137,7 +137,7 @@ def opened(parts: Sequence[Path]) -> Generator[Tensors]:
             files.check_utf8(path, files.RENAME)
             try:
                 with files.reading(path, "check the path"):
-                    with safe_open(path, framework="np"):  # it finds what is wrong with a header
+                    with safe_open(path, framework="np"):  # it validates the header
                         pass
                     found[path] = stack.enter_context(open(path, "rb"))
                     read.append(_header(path, found[path]))
@@ -160,7 +160,7 @@ def opened(parts: Sequence[Path]) -> Generator[Tensors]:
 
 
 def _header(path: Path, file: BufferedReader) -> TensorFile:
-    """A file's header, which safetensors has found right already."""
+    """A file's header, which safetensors has already validated."""
     length = file.read(8)
     raw = file.read(int.from_bytes(length, "little"))
     table: dict[str, Any] = json.loads(raw)
@@ -172,11 +172,11 @@ def _header(path: Path, file: BufferedReader) -> TensorFile:
 
 
 def retyped(part: TensorFile, types: Mapping[str, str]) -> TensorFile:
-    """A file with the same tensors, some of them of other types."""
+    """A file's header with other dtypes for some of the tensors."""
     if all(types.get(name, spec.dtype) == spec.dtype for name, spec in part.specs.items()):
         return part
     specs = {n: Spec(spec.shape, types.get(n, spec.dtype)) for n, spec in part.specs.items()}
-    # With the widest types first, every tensor is aligned. Other types are whole numbers, and last.
+    # With the widest types first, every tensor is aligned. Types of one byte come last.
     names = sorted(specs, key=lambda n: (-_size(specs[n].dtype), n))
     table: dict[str, Any] = {} if part.metadata is None else {"__metadata__": dict(part.metadata)}
     offsets, end = {}, 0
@@ -209,7 +209,7 @@ def nbytes(spec: Spec) -> int:
 
 
 def blocks(spec: Spec) -> Iterator[tuple[int, int]]:
-    """The first row, and that after the last one, of parts of a tensor that fit into memory."""
+    """The first row and the row after the last one of each block of a tensor, in turn."""
     if not spec.shape:
         yield 0, 1
         return
@@ -224,8 +224,8 @@ def write(path: Path, part: TensorFile, rows: Callable[[str, int, int], Tensor])
     """Write a file with this header.
 
     Args:
-        rows: what makes rows of a tensor, in the type that the header says; called for each
-            tensor in its order, from its first row to its last.
+        rows: returns rows of a tensor, in the header's dtype; called for the tensors in order, each
+            from its first row to its last.
     """
 
     def parts() -> Iterator[memoryview]:
@@ -239,7 +239,7 @@ def write(path: Path, part: TensorFile, rows: Callable[[str, int, int], Tensor])
 
 
 def equal(tensors: Tensors, one: str, other: str) -> bool:
-    """Whether two tensors have the same shape, type and values."""
+    """Whether two tensors have the same shape, dtype and values."""
     spec = tensors.specs[one]
     if spec != tensors.specs[other]:
         return False

@@ -1,8 +1,8 @@
-"""Which tensors of a robot policy are those of the VLM that it was made from, by name and shape.
+"""Find the tensors of the VLM in a robot policy that was made from it, by name and shape.
 
-A policy has its VLM under a prefix, such as `model.vlm_with_expert.vlm.`, and beside it an action
-expert whose layers have the same names. Releases of transformers have named a VLM's parts in
-several ways; `key` is one name for all of them.
+A policy has its VLM under a prefix, such as `model.vlm_with_expert.vlm.`, and an action expert
+whose layers have the same names. Releases of transformers name a VLM's parts in several ways; `key`
+gives one name for all of them.
 """
 
 from __future__ import annotations
@@ -15,28 +15,28 @@ from typing import NamedTuple
 
 from aegis_cli.common.errors import AegisError, few
 
-# Parts of names that one release of transformers has and another one has not:
+# Parts of names that some releases of transformers have and others do not:
 # `language_model.model.layers.0`, `model.language_model.layers.0` and `model.layers.0` are one.
 _WRAPPERS = ("model", "language_model", "text_model")
-_LANGUAGE = ("embed_tokens", "layers", "norm", "lm_head")  # how keys of the language model begin
+_LANGUAGE = ("embed_tokens", "layers", "norm", "lm_head")  # first parts of the text model's keys
 _LAYER = re.compile(r"layers\.(\d+)\.")
 TABLE, HEAD = "embed_tokens.weight", "lm_head.weight"
-# Their first axis is the vocabulary. PaliGemma's repositories have 257,216 rows, and pi0, which was
-# made from them, 257,152: the rows after these were added for transformers.
+# Tensors whose first axis is the vocabulary. PaliGemma's repositories have 257,216 rows, and pi0,
+# which was made from them, 257,152; the remaining rows were added for transformers.
 _OF_WORDS = (TABLE, HEAD, "lm_head.bias")
 _FLOATS = ("F64", "F32", "F16", "BF16")
 _BUFFERS = ("position_ids", "inv_freq")
 
 
 class Spec(NamedTuple):
-    """A tensor's shape, and its type by safetensors' name."""
+    """A tensor's shape, and safetensors' name of its dtype."""
 
     shape: tuple[int, ...]
     dtype: str
 
     @property
     def is_float(self) -> bool:
-        """Whether its numbers are of a type that weights learn in."""
+        """Whether its dtype is a floating-point type."""
         return self.dtype in _FLOATS
 
 
@@ -45,7 +45,7 @@ Specs = Mapping[str, Spec]
 
 @dataclass(frozen=True)
 class Kept:
-    """The VLM's own tensors of which the policy has none."""
+    """Tensors of the VLM that the policy does not have."""
 
     what: str
     why: str
@@ -57,14 +57,15 @@ class Match:
     """Where a policy has a VLM's tensors.
 
     Attributes:
-        prefix: what the VLM's names have before them in the policy.
-        taken: the VLM's name -> the policy's. Where words are scored by the table that they are
-            looked up in, both of a VLM's names may be one of the policy's.
-        rows: the VLM's name -> rows that both have, of tables with unequally many.
+        prefix: the prefix of the VLM's names in the policy.
+        taken: the VLM's name -> the policy's. If table and head are tied, both of a VLM's names may
+            map to the same name in the policy.
+        rows: the VLM's name -> number of common rows, for tables of different lengths.
         kept: what the policy does not have.
-        second: the policy's name of a table or head that the VLM ties to its other one, and that
-            one's name in the policy; None where it holds one of them at most, or the VLM both.
-        more: the policy's names under the prefix which the VLM has not.
+        second: the policy's name of the table or head that the VLM lacks, being tied to the other,
+            and the policy's name of that other one; None if the policy has at most one of them, or
+            the VLM has both.
+        more: the policy's names under the prefix that the VLM does not have.
     """
 
     prefix: str
@@ -76,10 +77,10 @@ class Match:
 
 
 def key(name: str) -> str:
-    """One name for a tensor of a VLM, whichever release of transformers has named it."""
+    """One name for a tensor of a VLM, whichever release of transformers named it."""
     found: list[str] = []
     for part in name.split("."):
-        # As of CLIP and SigLIP until transformers 5.5.
+        # As in CLIP and SigLIP until transformers 5.5.
         of_tower = part == "vision_model" and found[-1:] == ["vision_tower"]
         if part not in _WRAPPERS and not of_tower:
             found.append(part)
@@ -87,13 +88,13 @@ def key(name: str) -> str:
 
 
 def is_vlm(names: Iterable[str]) -> bool:
-    """Whether these are the names of a model with language layers and with something to see by."""
+    """Whether these are the names of a model with language layers and a vision part."""
     keys = [key(name) for name in names]
     return any(map(_LAYER.match, keys)) and any(not _is_language(found) for found in keys)
 
 
 def pair_of_tables(specs: Specs) -> tuple[str, str] | None:
-    """The names of a VLM's table and of its head, where the file has both; None: it has not."""
+    """The names of a VLM's table and head if the file has both, else None."""
     named = {key(name): name for name in specs}
     return (named[TABLE], named[HEAD]) if TABLE in named and HEAD in named else None
 
@@ -102,14 +103,14 @@ def match(base: Specs, policy: Specs, tied: bool, called: tuple[str, str]) -> Ma
     """Find the VLM's tensors in the policy.
 
     Args:
-        base: those of the VLM, in the file's names.
-        policy: all of the policy's.
+        base: the VLM's tensors, by their names in the file.
+        policy: all of the policy's tensors.
         tied: whether the VLM's table and head, if it has both, are the same.
-        called: what an error calls the policy and the VLM.
+        called: names of the policy and the VLM in errors.
 
     Raises:
-        AegisError: the policy has not got them, has them twice, in other shapes, or only some of
-            them, where more is missing than the layers behind those that it computes.
+        AegisError: the policy does not have them, has them twice or in other shapes, or lacks more
+            of them than the layers after the last one that it computes.
     """
     named = {key(name): name for name in base}
     if len(named) < len(base):
@@ -127,7 +128,7 @@ def match(base: Specs, policy: Specs, tied: bool, called: tuple[str, str]) -> Ma
     _check_shapes(base, policy, own, called)
     kept = _kept(named, base, own, called)
     used = {*own.values(), *(second or ())}
-    prefix = _common(used)  # `model.` of what may as well be found behind nothing
+    prefix = _common(used)  # includes a `model.` that keys ignore
     more = tuple(sorted(n for n in policy if n.startswith(prefix) and n not in used))
     _check_depth(prefix, more, named, called)
     rows = {
@@ -155,7 +156,7 @@ def _under_one_prefix(
 ) -> tuple[str, dict[str, str]]:
     """The prefix of the VLM in the policy, and the policy's names by key."""
     places = _places(named, policy)
-    # An action expert has layers of these names too, but nothing to see by.
+    # An action expert has layers with these names too, but no vision part.
     whole = {
         prefix: found
         for prefix, found in places.items()
@@ -163,7 +164,7 @@ def _under_one_prefix(
     }
     if not whole:
         raise _nothing(places, len(base), policy, called)
-    # `model.vlm.` and `model.vlm.model.` hold the same; the shorter one holds the head, too.
+    # `model.vlm.` and `model.vlm.model.` have the same tensors; the shorter one also has the head.
     found = _without_parts(whole)
     if len(found) > 1:
         alike = [p for p in found if all(_fits(base, policy, named, whole[p], e) for e in whole[p])]
@@ -190,14 +191,14 @@ def _under_one_prefix(
 
 
 def _common(names: Collection[str]) -> str:
-    """The parts that all of these names begin with."""
+    """The leading parts that all of these names share."""
     parts = zip(*(name.split(".")[:-1] for name in names), strict=False)
     alike = itertools.takewhile(lambda each: len(set(each)) == 1, parts)
     return "".join(f"{each[0]}." for each in alike)
 
 
 def _places(named: Collection[str], policy: Iterable[str]) -> dict[str, dict[str, list[str]]]:
-    """Prefix -> key of the VLM -> the policy's names that are that key behind the prefix."""
+    """Prefix -> key of the VLM -> the policy's names that have that key after the prefix."""
     places: dict[str, dict[str, list[str]]] = {}
     for name in policy:
         parts = name.split(".")
@@ -210,7 +211,7 @@ def _places(named: Collection[str], policy: Iterable[str]) -> dict[str, dict[str
 
 
 def _without_parts(whole: Mapping[str, Mapping[str, list[str]]]) -> list[str]:
-    """The prefixes but for those that hold no more than a shorter one of them does."""
+    """The prefixes, without those whose tensors a shorter prefix also has."""
     found: list[str] = []
     held: list[set[str]] = []
     for prefix in sorted(whole, key=len):
@@ -232,7 +233,7 @@ def _fits(
 
 
 def _alike(own: Spec, other: Spec, each: str) -> bool:
-    """Whether a tensor of the policy may take the place of the VLM's."""
+    """Whether a tensor of the policy can replace the VLM's."""
     if own.is_float != other.is_float:
         return False
     if each in _OF_WORDS and own.shape and other.shape:
@@ -246,7 +247,7 @@ def _nothing(
     policy: Specs,
     called: tuple[str, str],
 ) -> AegisError:
-    """The error for a policy without the VLM, of that many tensors."""
+    """The error for a policy without the VLM, which has `vlm_has` tensors."""
     expected = "a policy that was made from this VLM, with its vision and its language layers"
     fix = "give the VLM that the policy was made from"
     most = max(places, key=lambda prefix: len(places[prefix]), default=None)
@@ -272,13 +273,13 @@ def _tie(
     words: Mapping[str, str],
     tied: bool,
 ) -> tuple[str, str] | None:
-    """Give a tied table and head each other's tensor where the policy holds one of them.
+    """If the policy has only one of a tied table and head, use it for both.
 
-    LeRobot and openpi have written pi0 with its head alone, which PaliGemma has not.
+    LeRobot and openpi write pi0 with only its head, which PaliGemma does not have.
 
     Args:
-        own: the VLM's name -> the policy's, which is added to.
-        words: the policy's names of its table and its head by their keys, as far as it has them.
+        own: the VLM's name -> the policy's; entries are added.
+        words: the policy's names of its table and head by their keys, as far as it has them.
 
     Returns:
         As `Match.second`.
@@ -318,15 +319,15 @@ def _said(spec: Spec) -> str:
 def _kept(
     named: Mapping[str, str], base: Specs, own: Mapping[str, str], called: tuple[str, str]
 ) -> tuple[Kept, ...]:
-    """What the policy does not have, where it can do without.
+    """What the policy does not have and does not need.
 
     Raises:
-        AegisError: more than that.
+        AegisError: a tensor that it needs is missing.
     """
     missing = {each: name for each, name in named.items() if name not in own}
     layers = {number for each in named if (number := _layer(each)) is not None}
     there = {number for name in own if (number := _layer(key(name))) is not None}
-    # Without a gap: a layer that is there in part is in the middle, as those before it are.
+    # No gaps: up to the last layer that is present, even in part, no weights may be missing.
     first = max(there, default=-1) + 1
     upper, after, buffers, middle = [], [], [], []
     for each, name in sorted(missing.items()):
@@ -359,7 +360,7 @@ def _kept(
 def _check_depth(
     prefix: str, more: Iterable[str], named: Collection[str], called: tuple[str, str]
 ) -> None:
-    """Raise AegisError where the policy has more language layers than the VLM."""
+    """Raise AegisError if the policy has more language layers than the VLM."""
     depth = 1 + max(number for each in named if (number := _layer(each)) is not None)
     beyond = [n for n in more if (_layer(key(n.removeprefix(prefix))) or 0) >= depth]
     if beyond:

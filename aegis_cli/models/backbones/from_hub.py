@@ -1,4 +1,4 @@
-"""Loading what transformers loads: offline, without a folder's own code, and with one error."""
+"""Load models with transformers: offline, without a folder's own code, and with one clear error."""
 
 from __future__ import annotations
 
@@ -21,8 +21,7 @@ T = TypeVar("T", bound=nn.Module)
 # Arguments of `from_pretrained`: no network, and no code out of a model folder.
 SAFE: dict[str, Any] = {"local_files_only": True, "trust_remote_code": False}
 
-# What transformers raises on folders that lack something, are damaged, or hold what its classes
-# refuse.
+# What transformers raises for folders that are incomplete, damaged, or refused by its classes.
 _UNLOADABLE = (
     OSError,
     ValueError,
@@ -38,11 +37,11 @@ _UNLOADABLE = (
 
 @contextlib.contextmanager
 def loading(folder: Path, what: str) -> Generator[None]:
-    """What transformers finds wrong with a folder, as the one error a user sees."""
+    """Turn transformers' errors about a folder into the one error that a user sees."""
     try:
         yield
     except _UNLOADABLE as error:
-        # A Git LFS pointer in the place of weights has an error of its own, with its cure.
+        # A Git LFS pointer in place of weights has its own error, which says what to do.
         for path in model_folder.weights(folder):
             files.refuse_pointer(path)
         if "torchvision" in str(error).lower():
@@ -53,7 +52,7 @@ def loading(folder: Path, what: str) -> Generator[None]:
             ) from error
         fix = "download or export the model again"
         if what == "processor" and not is_torchvision_available():
-            # Earlier releases of transformers do not know such a processor then.
+            # In that case, earlier releases of transformers do not know the processor.
             fix += ", or `pip install torchvision`, which its images may need"
         raise AegisError(
             f"the {what} in '{folder}' does not load: {in_short(error)}",
@@ -66,7 +65,7 @@ def complete(kind: Any, folder: Path, config: Any) -> Any:
     """The model of class `kind` in a folder, in float32.
 
     Raises:
-        AegisError: weights that are missing, left over, or of another shape than the config's.
+        AegisError: weights that are missing, unexpected, or of another shape than in the config.
     """
     model, report = kind.from_pretrained(
         folder,
@@ -74,7 +73,7 @@ def complete(kind: Any, folder: Path, config: Any) -> Any:
         dtype=torch.float32,
         use_safetensors=True,
         output_loading_info=True,
-        ignore_mismatched_sizes=True,  # they are refused below, with their names
+        ignore_mismatched_sizes=True,  # refused below, by name
         **SAFE,
     )
     model_folder.check_complete(folder, report)
@@ -83,7 +82,7 @@ def complete(kind: Any, folder: Path, config: Any) -> Any:
 
 @contextlib.contextmanager
 def quiet() -> Generator[None]:
-    """Without transformers' warnings and bars: what matters of them is an error here."""
+    """Silence transformers' warnings and progress bars; those that matter are errors here."""
     level, bars = logging.get_verbosity(), logging.is_progress_bar_enabled()
     logging.set_verbosity_error()
     logging.disable_progress_bar()
@@ -96,13 +95,13 @@ def quiet() -> Generator[None]:
 
 
 def without_dropout(model: T) -> T:
-    """Set every dropout of the model to 0; the configuration that is saved stays as it is.
+    """Set every dropout of the model to 0; the configuration that is saved does not change.
 
-    This holds in training mode too, which checkpointing needs. So the expert reads what the anchor
-    was measured on, a step depends on nothing but its number, and validation is not left to chance.
+    This also holds in training mode, which gradient checkpointing needs. So the expert reads what
+    the anchor was measured on, a step depends only on its number, and validation is deterministic.
     """
     for module in model.modules():
-        # Attention modules keep their rate as a number of their own, without an `nn.Dropout`.
+        # Attention modules store their rate as a plain number, without an `nn.Dropout`.
         for name, value in list(vars(module).items()):
             is_rate = name.endswith("dropout") or (name == "p" and isinstance(module, nn.Dropout))
             if is_rate and isinstance(value, float):

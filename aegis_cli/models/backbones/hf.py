@@ -1,8 +1,8 @@
 """Hugging Face VLMs as backbones.
 
-Nothing here reimplements a model: its own forward pass and `generate` run on what its own processor
-makes of images and texts, and what passes through is recorded (recording.py). Besides this file,
-only clip.py and from_hub.py import transformers.
+Nothing here reimplements a model: its own forward pass and `generate` run on the output of its own
+processor, and what passes through the layers is recorded (recording.py). Besides this file, only
+clip.py and from_hub.py import transformers.
 """
 
 from __future__ import annotations
@@ -36,15 +36,15 @@ from aegis_cli.models.backbones.prompting import Prompter
 from aegis_cli.models.backbones.recording import Seen, recording, sliding_window, unrotated
 from aegis_cli.models.structure import of_type, outermost_lists, widest
 
-MAX_ANSWER = 32  # the most tokens of an answer, unless its reference is longer
+MAX_ANSWER = 32  # tokens of an answer at most, unless its reference is longer
 
 
 class _Answered(NamedTuple):
     """Prompts [B] followed by their answers.
 
     Attributes:
-        lengths: number of tokens of each prompt alone.
-        said: tokens of each answer, without its end.
+        lengths: number of tokens of each prompt, without its answer.
+        said: tokens of each answer, without the end token.
     """
 
     batch: Batch
@@ -307,7 +307,7 @@ class HFBackbone(Backbone):
         return self._prompter.decode([row[:own] for row, own in zip(rows, most, strict=True)])
 
     def answers(self, batches: Iterable[Asked]) -> Iterator[tuple[list[str], Tensor]]:
-        """See `Backbone.answers`; for a GPU the next batches are prepared meanwhile."""
+        """See `Backbone.answers`; on a GPU, the next batches are prepared at the same time."""
 
         def prepare(asked: Asked) -> tuple[Batch, _Answered]:
             images, questions, _ = asked
@@ -315,7 +315,7 @@ class HFBackbone(Backbone):
 
         with prefetch.for_device(prepare, batches, self.device) as prepared:
             for prompts, answered in prepared:
-                # One more than the reference, so that a longer answer is not taken for it.
+                # One more than the reference, so that a longer answer does not match it.
                 most = [max(MAX_ANSWER, len(said) + 1) for said in answered.said]
                 yield self._generated(prompts, most), self._log_likelihood(answered)
 
@@ -392,7 +392,7 @@ class HFBackbone(Backbone):
         answers: Sequence[str],
         together: int = 8,
     ) -> Iterator[AnswerScores]:
-        """See `Backbone.read_vqa`; an image is passed for each question, which may affect it."""
+        """See `Backbone.read_vqa`; an image is passed per question, which may affect its states."""
         said = self._prompter.answer_ids(answers)
         # Shapes matter because images of different sizes may become different numbers of tokens.
         shapes = [tuple(images[i].shape) for i in image_of.tolist()]
@@ -504,8 +504,8 @@ def _greedy(model: transformers.PreTrainedModel, filler: int) -> Generator[None]
     """Inside the block, the model decodes greedily until an end token.
 
     Its own settings may sample, or penalise words of the question, as `repetition_penalty` does.
-    Only its tokens for begin and end of a text are kept. The padding token is the tokenizer's: the
-    model's own may not be in its vocabulary.
+    Only its begin and end tokens are kept. The padding token is the tokenizer's, since the model's
+    own may not be in its vocabulary.
     """
     own = model.generation_config
     tokens = {"bos_token_id": own.bos_token_id, "eos_token_id": own.eos_token_id}
@@ -531,7 +531,7 @@ def _arguments(batch: Batch) -> dict[str, Tensor]:
 
 
 def load(folder: Path, layers: str | None) -> HFBackbone:
-    """The model in a folder, in float32 whatever it is stored in.
+    """The model in a folder, in float32 whatever dtype it is stored in.
 
     Args:
         folder: with config.json, *.safetensors and the processor's files.
@@ -539,7 +539,7 @@ def load(folder: Path, layers: str | None) -> HFBackbone:
 
     Raises:
         AegisError: a model without images, of an unknown family, with missing or unexpected
-            weights, or whose processor is not there or of another model.
+            weights, or whose processor is missing or belongs to another model.
     """
     model_folder.check_files(folder, transformers.CONFIG_MAPPING)
     kind = transformers.AutoModelForImageTextToText
@@ -549,7 +549,7 @@ def load(folder: Path, layers: str | None) -> HFBackbone:
 
 
 def check(folder: Path) -> None:
-    """Raise AegisError unless a folder is that of a model which takes images with its text."""
+    """Raise AegisError unless a folder holds a model that takes images with text."""
     model_folder.check_files(folder, transformers.CONFIG_MAPPING)
     with quiet(), loading(folder, "model"):
         config = transformers.AutoConfig.from_pretrained(folder, **SAFE)
@@ -560,7 +560,7 @@ def described(folder: Path) -> HFBackbone:
     """The model that a folder of `save_description` describes; its weights are still to come.
 
     Raises:
-        AegisError: a description that makes no model, or a processor of another one.
+        AegisError: a description from which no model can be built, or another model's processor.
     """
     return _assembled(folder, None, lambda config: _without_weights(folder, config))
 
@@ -569,7 +569,7 @@ def _without_weights(folder: Path, config: Any) -> transformers.PreTrainedModel:
     kind = transformers.AutoModelForImageTextToText
     model = kind.from_config(config, dtype=torch.float32)
     if (folder / "generation_config.json").is_file():
-        # It says which tokens end an answer.
+        # It lists the tokens that end an answer.
         model.generation_config = transformers.GenerationConfig.from_pretrained(folder)
     return model
 
@@ -577,7 +577,7 @@ def _without_weights(folder: Path, config: Any) -> transformers.PreTrainedModel:
 def _assembled(
     folder: Path, layers: str | None, make: Callable[[Any], transformers.PreTrainedModel]
 ) -> HFBackbone:
-    """The backbone of what `make` makes of the folder's configuration."""
+    """The backbone around the model that `make` builds from the folder's configuration."""
     with quiet(), loading(folder, "model"):
         config = transformers.AutoConfig.from_pretrained(folder, **SAFE)
         _check_kind(folder, config)
@@ -588,9 +588,9 @@ def _assembled(
     with quiet(), loading(folder, "processor"):
         processor = _processor(folder)
     tokenizer = processor.tokenizer
-    if not processor.chat_template:  # a tokenizer that was saved by itself holds it
+    if not processor.chat_template:  # a separately saved tokenizer holds it
         processor.chat_template = tokenizer.chat_template
-    if tokenizer.pad_token is None:  # as of LLaMA: what is padded is masked
+    if tokenizer.pad_token is None:  # as in LLaMA's; padding is masked anyway
         tokenizer.pad_token = tokenizer.eos_token
     if family.prompt is None and not processor.chat_template:
         raise model_folder.misfit(f"no chat template in '{folder}', by which the model is asked")

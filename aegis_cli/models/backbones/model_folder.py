@@ -16,7 +16,7 @@ from aegis_cli.common.errors import AegisError, in_short
 from aegis_cli.models.backbones.base import FLOAT32
 from aegis_cli.models.backbones.families import FAMILIES, REFUSED, Family
 
-_OWN = "aegis.json"  # in a saved folder of a family that is not known: where its layers are
+_OWN = "aegis.json"  # in a saved folder of an unknown family: the path of its layers
 _MODEL_FILES = {"config.json", "generation_config.json", _OWN}
 _TEMPLATES = "additional_chat_templates"
 # The parts of a processor, and the files that may hold one.
@@ -39,11 +39,11 @@ def fetch(name: str) -> Path:
     """The local folder of a model on the hub, downloaded if it is not there.
 
     Raises:
-        AegisError: neither in the cache nor to be had.
+        AegisError: neither in the cache nor downloadable.
     """
     wanted = [f"*{suffix}" for suffix in (*_PROCESSOR_SUFFIXES, ".safetensors")]
     try:
-        # Mistral's repositories have their weights twice.
+        # Mistral's repositories contain their weights twice.
         return hub.snapshot(name, "model", wanted, unwanted=["consolidated*"])
     except (OSError, ValueError) as error:
         raise AegisError(
@@ -56,14 +56,14 @@ def fetch(name: str) -> Path:
 
 
 def is_model(folder: Path) -> bool:
-    """Whether a folder holds a model of the hub's layout."""
+    """Whether a folder holds a model in the hub's layout."""
     return (folder / "config.json").is_file()
 
 
 def is_policy(folder: Path) -> bool:
     """Whether a folder holds a whole policy of ours in LeRobot's layout (models/lerobot_folder.py).
 
-    LeRobot's configuration bears the same name as a model's of the hub.
+    LeRobot's configuration file has the same name as that of a model on the hub.
     """
     path = folder / "config.json"
     if not path.is_file() or not (folder / "model.safetensors").is_file():
@@ -76,12 +76,12 @@ def is_own_config(content: bytes) -> bool:
     try:
         config = files.parse_json(content)
     except ValueError:
-        return False  # whoever loads it as a model of the hub says what is wrong
+        return False  # loading it as a model of the hub gives the error
     return isinstance(config, dict) and config.get("type") == "aegis"
 
 
 def foreign_policy(path: Path) -> str | None:
-    """What LeRobot calls the policy of another program; None: this is none.
+    """LeRobot's name for the type of another program's policy; None if it is not one.
 
     Args:
         path: its folder, or a file in it.
@@ -99,7 +99,7 @@ def foreign_policy(path: Path) -> str | None:
 
 
 def refuse_foreign_policy(path: Path) -> None:
-    """Raise AegisError for a robot policy of LeRobot's that is not of ours."""
+    """Raise AegisError for a robot policy of LeRobot that is not ours."""
     if (kind := foreign_policy(path)) is not None:
         folder = path if path.is_dir() else path.parent
         raise AegisError(
@@ -110,7 +110,7 @@ def refuse_foreign_policy(path: Path) -> None:
 
 
 def take_out(policy: object) -> str:
-    """How the VLM is had of a policy that another program trained."""
+    """How to extract the VLM from a policy that another program trained."""
     command = commands.aegis("extract", policy)
     return (
         f"if it was made from a VLM, take that out, as {command} --base VLM --out FOLDER: aegis "
@@ -119,12 +119,12 @@ def take_out(policy: object) -> str:
 
 
 def weights(folder: Path) -> list[Path]:
-    """Its files of weights, of which there may be several."""
+    """A folder's files of weights, of which there may be several."""
     return sorted(folder.glob("*.safetensors"))
 
 
 def stored_type(folder: Path) -> str:
-    """Name of the type that all weights in the files are of; float32 where they differ."""
+    """Name of the dtype of all weights in the files; float32 if they differ."""
     found = set()
     for path in weights(folder):
         # Only headers are read: `get_slice` does not load a tensor.
@@ -137,11 +137,11 @@ def stored_type(folder: Path) -> str:
 
 
 def processor_files(folder: Path) -> dict[str, bytes]:
-    """Contents of what is neither the model's weights nor its configuration, by path."""
+    """Contents, by path, of files that are neither the model's weights nor its configuration."""
     inside = [*folder.iterdir(), *(folder / _TEMPLATES).glob("*")]
     found = {}
     for path in sorted(inside):
-        # An index lists the shards of the weights, which are saved as one file.
+        # An index lists the weights' shards, but the weights are saved as one file.
         of_model = path.name in _MODEL_FILES or path.name.endswith(".index.json")
         if path.suffix in _PROCESSOR_SUFFIXES and path.is_file() and not of_model:
             found[str(path.relative_to(folder))] = path.read_bytes()
@@ -149,9 +149,9 @@ def processor_files(folder: Path) -> dict[str, bytes]:
 
 
 def check_processor(folder: Path) -> None:
-    """Raise AegisError unless a folder has a file of each part of a processor.
+    """Raise AegisError unless a folder has a file for each part of a processor.
 
-    transformers would make a tokenizer without words of none.
+    Without files, transformers would create an empty tokenizer.
     """
     own = {path.name for path in folder.iterdir()}
     for part, names in _PARTS.items():
@@ -164,7 +164,7 @@ def check_processor(folder: Path) -> None:
 
 
 def processor_class(folder: Path) -> str | None:
-    """The name that the folder's files give."""
+    """The name of the processor's class in the folder's files."""
     for name in ("processor_config.json", "preprocessor_config.json", "tokenizer_config.json"):
         path = folder / name
         if not path.is_file():
@@ -176,10 +176,10 @@ def processor_class(folder: Path) -> str | None:
 
 
 def family(folder: Path, kind: str, layers: str | None) -> Family:
-    """The row of the table for a model of type `kind`, or one with the layers that were named.
+    """The row of the table for a model of type `kind`, with `layers` in place of its own, if given.
 
     Raises:
-        AegisError: neither.
+        AegisError: an unknown type without layers.
     """
     if layers is None and (folder / _OWN).is_file():
         said = files.load_json(folder / _OWN)
@@ -197,7 +197,7 @@ def family(folder: Path, kind: str, layers: str | None) -> Family:
 
 
 def remember_layers(folder: Path, layers: str) -> None:
-    """So that whoever loads the folder need not name them again."""
+    """Record the layers' path, so that it need not be given again when the folder is loaded."""
     (folder / _OWN).write_text(json.dumps({"layers": layers}), encoding="utf-8")
 
 
@@ -224,7 +224,7 @@ def check_path(model: nn.Module, layers: str) -> nn.ModuleList:
     """
     modules = dict(model.named_modules())
     lists = {name: module for name, module in modules.items() if isinstance(module, nn.ModuleList)}
-    # By the `rotary_emb` beside it a language model's list is told from other lists of blocks.
+    # The `rotary_emb` beside it tells a language model's list from other lists of blocks.
     rotated = []
     for name in lists:
         parent = name.rpartition(".")[0]
@@ -244,7 +244,7 @@ def check_path(model: nn.Module, layers: str) -> nn.ModuleList:
 
 
 def check_files(folder: Path, kinds: Container[str]) -> None:
-    """Raise AegisError unless the folder is of one of these `kinds` of models, in safetensors."""
+    """Raise AegisError unless the folder has a model of one of these `kinds`, in safetensors."""
     refuse_adapter(folder)
     refuse_foreign_policy(folder)
     path, again = folder / "config.json", "download or export the model again"
@@ -280,7 +280,7 @@ def check_files(folder: Path, kinds: Container[str]) -> None:
 
 
 def _refuse_quantised(folder: Path, config: dict[str, Any]) -> None:
-    """Raise AegisError for weights that are packed: no gradient reaches them."""
+    """Raise AegisError for quantised weights, which no gradient reaches."""
     parts = [config, *(part for part in config.values() if isinstance(part, dict))]
     for part in parts:
         if isinstance(said := part.get("quantization_config"), dict):
@@ -294,7 +294,7 @@ def _refuse_quantised(folder: Path, config: dict[str, Any]) -> None:
 
 
 def refuse_adapter(folder: Path) -> None:
-    """Raise AegisError for an adapter: transformers would put it into the model that it loads."""
+    """Raise AegisError for an adapter, which transformers would add to the model that it loads."""
     if (folder / "adapter_config.json").is_file():
         raise AegisError(
             f"an adapter of PEFT in '{folder}' (adapter_config.json)",
@@ -305,7 +305,7 @@ def refuse_adapter(folder: Path) -> None:
 
 
 def refuse_part(path: Path) -> None:
-    """Raise AegisError for a file of weights out of a model's folder, where the folder is meant."""
+    """Raise AegisError for a file of weights given instead of its model's folder."""
     folder = path.parent
     if path.suffix == ".safetensors" and is_model(folder) and not is_policy(folder):
         refuse_foreign_policy(path)
@@ -317,7 +317,7 @@ def refuse_part(path: Path) -> None:
 
 
 def refuse_gguf(path: Path) -> None:
-    """Raise AegisError for a model in llama.cpp's form: a file, or a folder without others."""
+    """Raise AegisError for a model in llama.cpp's format: a file, or a folder with nothing else."""
     found = [path] if path.suffix == ".gguf" else sorted(path.glob("*.gguf"))
     if found and not weights(path):
         raise AegisError(
@@ -350,7 +350,7 @@ def _unsuitable(found: str, why: str) -> AegisError:
 
 
 def headless(model: nn.Module) -> AegisError:
-    """The error for a model that answers with other things than words."""
+    """The error for a model that does not answer with words."""
     return AegisError(
         f"a {type(model).__name__} without a head that scores words",
         "a vision-language model that answers with words",
@@ -359,7 +359,7 @@ def headless(model: nn.Module) -> AegisError:
 
 
 def foreign_rotation(layer: int) -> AegisError:
-    """The error for a family whose keys the expert's own would not fit."""
+    """The error for a family whose keys are rotated differently from the expert's."""
     found = f"layer {layer} rotates its keys in a way of its own, or not at all"
     expected = (
         "one rotary embedding for all layers, the second half of the channels like the "
@@ -369,7 +369,7 @@ def foreign_rotation(layer: int) -> AegisError:
 
 
 def misfit(problem: str) -> AegisError:
-    """What to say of a model and a processor that do not work together."""
+    """The error for a model and a processor that do not work together."""
     return AegisError(
         f"a model and a processor that do not fit together: {problem}",
         "the processor that the model was trained with",
