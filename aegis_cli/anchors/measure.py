@@ -340,7 +340,7 @@ def _check_frames(settings: Settings, demos: Path | None) -> Path:
     if others:
         raise AegisError(
             f"{', '.join(others)} of robot frames",
-            "moments alone: the other parts need answers, which frames have not",
+            "only moments: the other parts need answers, which frames do not have",
             "--parts moments, or leave --demos out",
         )
     if demos is None:

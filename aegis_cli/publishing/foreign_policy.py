@@ -93,8 +93,8 @@ def locate(name: str) -> Path:
             f"no folder '{name}', and no policy of that name from the Hugging Face hub: "
             f"{in_short(error)}",
             f"{_EXPECTED}, or a hub id with a network (and, for a private policy, a token)",
-            f"check the path; or where there is a network: hf download {name} --local-dir POLICY; "
-            "then give POLICY",
+            f"check the path; or, on a machine with a network: hf download {name} "
+            "--local-dir POLICY; then give POLICY",
         ) from error
 
 

@@ -192,12 +192,12 @@ def retyped(part: TensorFile, types: Mapping[str, str]) -> TensorFile:
     return TensorFile(part.path, head, in_order, offsets, part.metadata)
 
 
-_BITS = {"64": 8, "32": 4, "16": 2}
+_BYTES = {"64": 8, "32": 4, "16": 2}
 
 
 def _size(dtype: str) -> int:
     """Bytes of one number."""
-    return next((size for bits, size in _BITS.items() if dtype.endswith(bits)), 1)
+    return next((size for bits, size in _BYTES.items() if dtype.endswith(bits)), 1)
 
 
 def nbytes(spec: Spec) -> int:

@@ -163,7 +163,7 @@ def _source_checks(recipe: Recipe) -> Iterator[Problem]:
     if recipe.anchor.source == "demos" and recipe.anchor.parts != ("moments",):
         yield Problem(
             f"anchor.parts: {', '.join(recipe.anchor.parts)} with anchor.source: demos",
-            "moments alone: the other parts need answers, which frames have not",
+            "only moments: the other parts need answers, which frames do not have",
             "set anchor.parts to [moments]",
         )
 

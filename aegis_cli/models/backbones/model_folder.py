@@ -50,7 +50,7 @@ def fetch(name: str) -> Path:
             f"no folder '{name}', and no model of that name from the Hugging Face hub: "
             f"{in_short(error)}",
             "a local model, or a hub id with a network (and, for a gated model, a token)",
-            f"where there is a network: hf download {name} --local-dir MODEL; then give MODEL: "
+            f"on a machine with a network: hf download {name} --local-dir MODEL; then give MODEL: "
             f"{GIVE}",
         ) from error
 
