@@ -275,7 +275,8 @@ Resume = Annotated[
     bool,
     Option(
         "--resume",
-        help=" A finished run of a policy continues if train.steps is larger than before.",
+        help=f"{_RESUMED} A finished run of a policy continues if train.steps is larger than "
+        "before.",
     ),
 ]
 ResumePretraining = Annotated[bool, Option("--resume", help=_RESUMED)]
