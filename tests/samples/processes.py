@@ -11,6 +11,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
+from multiprocessing import forkserver
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any, TypeVar
@@ -80,6 +81,9 @@ def _command(args: Sequence[str], cwd: str, said: str) -> None:
 def _server() -> multiprocessing.context.BaseContext:
     """The context whose processes are forked from one that has everything imported."""
     multiprocessing.set_forkserver_preload(list(IMPORTED))
+    # Started here. Begun by a pool of workers, it would inherit the signals that are blocked there,
+    # and so would every process that a later test sends one to.
+    forkserver.ensure_running()
     return multiprocessing.get_context("forkserver")
 
 
