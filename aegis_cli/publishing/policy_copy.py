@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -28,9 +28,9 @@ class Contents(NamedTuple):
         stale: entries named in STALE, with nothing of their contents.
     """
 
-    folders: tuple[Path, ...]
-    files: tuple[Path, ...]
-    stale: tuple[Path, ...]
+    folders: Sequence[Path]
+    files: Sequence[Path]
+    stale: Sequence[Path]
 
 
 def contents(folder: Path, without: Collection[Path]) -> Contents:
@@ -43,16 +43,16 @@ def contents(folder: Path, without: Collection[Path]) -> Contents:
         AegisError: an entry that is neither file nor folder, that cannot be read, or a link that
             leads out of the folder, to nothing or in a circle.
     """
-    found = Contents((), (), ())
+    folders, files, stale = [], [], []
     for path in _below(folder, without, _homes(folder), (os.path.realpath(folder),)):
         inside = path.relative_to(folder)
         if path.name in STALE:
-            found = found._replace(stale=(*found.stale, inside))
+            stale.append(inside)
         elif path.is_dir():
-            found = found._replace(folders=(*found.folders, inside))
+            folders.append(inside)
         else:
-            found = found._replace(files=(*found.files, inside))
-    return found
+            files.append(inside)
+    return Contents(folders, files, stale)
 
 
 def copy(found: Contents, source: Path, target: Path) -> None:
@@ -90,16 +90,16 @@ def _below(
     for path in sorted(folder.iterdir()):
         if path.name in _NEVER or path in without:
             continue
-        real = os.path.realpath(path)
-        if path.is_symlink():
-            _check_link(path, Path(real), homes)
         if path.name in STALE:
             yield path
             continue
+        real = os.path.realpath(path)
+        if path.is_symlink():
+            _check_link(path, Path(real), homes)
         if not (path.is_dir() or path.is_file()):
             raise _refused(path, "neither a file nor a folder", "remove it")
-        if not os.access(path, os.R_OK):
-            raise _refused(path, "which cannot be read", "make it readable (chmod u+r)")
+        if not os.access(path, os.R_OK | (os.X_OK if path.is_dir() else 0)):
+            raise _refused(path, "which cannot be read", "make it readable (chmod u+rX)")
         if real in above:
             raise _refused(path, "a link to a folder that it lies in", "remove the link")
         yield path
