@@ -17,7 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from aegis_cli.common.errors import AegisError
+from aegis_cli.common.errors import AegisError, few
 from aegis_cli.common.events import OnEvent, Progress, Warned, ignore
 from aegis_cli.common.files import (
     check_utf8,
@@ -151,18 +151,22 @@ class _Counted:
         shared = before[: until - first] if before.ndim else before
         if not torch.equal(own, shared.to(own.dtype)):
             self.moved.add(name)
-        if dtype is None:
-            return own
-        written = checked_cast(own, dtype, pair.match.taken[name], self._called[0])
+        written = own
+        if dtype is not None:
+            written = checked_cast(own, dtype, shared, (pair.match.taken[name], self._called[0]))
         if not torch.equal(written.to(own.dtype), own):
             self.rounded.add(name)
         if until < last:
-            return torch.cat([written, before[until - first :].to(dtype)])
+            return torch.cat([written, before[until - first :].to(written.dtype)])
         return written
 
 
-def checked_cast(own: Tensor, dtype: torch.dtype, name: str, called: str) -> Tensor:
+def checked_cast(own: Tensor, dtype: torch.dtype, other: Tensor, named: tuple[str, str]) -> Tensor:
     """A tensor in another dtype.
+
+    Args:
+        other: the same tensor of the other model, which may have infinite values too, as masks do.
+        named: the tensor's name, and that of its model.
 
     Raises:
         AegisError: numbers that are not finite, before or after the conversion.
@@ -170,6 +174,7 @@ def checked_cast(own: Tensor, dtype: torch.dtype, name: str, called: str) -> Ten
     written = own.to(dtype)
     if written.isfinite().all():
         return written
+    name, called = named
     if own.isfinite().all():
         said = str(dtype).removeprefix("torch.")
         raise AegisError(
@@ -177,6 +182,8 @@ def checked_cast(own: Tensor, dtype: torch.dtype, name: str, called: str) -> Ten
             "a type that holds them",
             "extract with --dtype float32",
         )
+    if torch.equal(own, other.to(own.dtype)):
+        return written
     raise AegisError(
         f"'{name}' of '{called}' has NaN or infinite values",
         "finite numbers",
@@ -206,8 +213,10 @@ def _write_weights(
     for part in pair.vlm.parts:
         new = tensor_files.retyped(part, types)
         size += sum(tensor_files.nbytes(spec) for spec in new.specs.values())
-        tensor_files.write(folder / part.path.name, new, rows)
-    names = {part.path.name for part in pair.vlm.parts}
+        place = folder / part.path.relative_to(pair.vlm_at)
+        make_folder(place.parent)
+        tensor_files.write(place, new, rows)
+    names = {part.path.relative_to(pair.vlm_at).as_posix() for part in pair.vlm.parts}
     for index in sorted(pair.vlm_at.glob("*.safetensors.index.json")):
         said = load_json(index)
         if isinstance(said, dict) and set((said.get("weight_map") or {}).values()) == names:
@@ -330,7 +339,16 @@ def _warn(report: ExtractReport, pair: Pair, on_event: OnEvent) -> None:
                 f"stored in {report.dtype}; --dtype float32 keeps them",
             )
         )
-    if report.moved == 0:
+    if report.moved == 0 and report.more:
+        on_event(
+            Warned(
+                "extract",
+                "none of the policy's tensors differs from the base's, but others are left out, "
+                f"which the base does not have: {few(report.more)}; whatever they learned is not "
+                "in the extracted VLM",
+            )
+        )
+    elif report.moved == 0:
         on_event(
             Warned(
                 "extract",

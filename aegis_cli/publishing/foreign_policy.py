@@ -12,7 +12,7 @@ from aegis_cli.common import commands, files, hub
 from aegis_cli.common.errors import AegisError, in_short
 from aegis_cli.models import backbones
 from aegis_cli.models.backbones import model_folder
-from aegis_cli.publishing import tensor_files, vlm_names
+from aegis_cli.publishing import policy_copy, tensor_files, vlm_names
 from aegis_cli.publishing.tensor_files import Tensors
 from aegis_cli.publishing.vlm_names import Match
 from aegis_cli.training import checkpoint
@@ -87,7 +87,7 @@ def locate(name: str) -> Path:
             fix += ", or pip install 'aegis-vla[hub]', which asks the hub for it"
         raise AegisError(f"no policy '{name}'", f"{_EXPECTED}, or a hub id", fix)
     try:
-        return hub.snapshot(name, "model", ["*"])
+        return hub.snapshot(name, "model", ["*"], policy_copy.STALE_ON_HUB)
     except (OSError, ValueError) as error:
         raise AegisError(
             f"no folder '{name}', and no policy of that name from the Hugging Face hub: "

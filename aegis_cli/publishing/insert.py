@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -10,16 +9,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from aegis_cli.common.errors import AegisError
-from aegis_cli.common.events import OnEvent, ignore
+from aegis_cli.common.errors import AegisError, few
+from aegis_cli.common.events import OnEvent, Warned, ignore
 from aegis_cli.common.files import folder_aside, make_folder, put
-from aegis_cli.publishing import foreign_policy, tensor_files
+from aegis_cli.publishing import foreign_policy, policy_copy, tensor_files
 from aegis_cli.publishing.extract import Share, check_new, checked_cast, count, told
 from aegis_cli.publishing.foreign_policy import Pair
+from aegis_cli.publishing.policy_copy import Contents
 from aegis_cli.publishing.tensor_files import TYPES
 from aegis_cli.training import checkpoint
-
-_NOT_COPIED = (".git", ".cache")  # from a clone of a repository, and from a download
 
 
 @dataclass(frozen=True)
@@ -31,7 +29,7 @@ class InsertReport:
         tensors, parameters: the policy's, of which `put` now come from the VLM.
         changed: how many of those that were put in differ from what the policy had.
         rounded: how many of those that were put in lost precision.
-        left_out: what the VLM has and the policy does not.
+        left_out: what the VLM has and the policy does not, and the policy's head if it stays.
     """
 
     out: str
@@ -62,7 +60,8 @@ def run(vlm: str, policy: str, out: Path, on_event: OnEvent = ignore) -> InsertR
         out: a new folder; if this fails, nothing of it is left.
 
     Raises:
-        AegisError: as `aegis extract` does, or a policy that is a file.
+        AegisError: as `aegis extract` does, or a policy that is a file, or whose folder cannot be
+            copied.
     """
     check_new(out)
     with foreign_policy.opened(policy, vlm) as pair:
@@ -79,15 +78,18 @@ def run(vlm: str, policy: str, out: Path, on_event: OnEvent = ignore) -> InsertR
                 "choose another --out",
             )
         rows = _Rows(pair, vlm)
+        beside = policy_copy.contents(pair.policy_at, {part.path for part in pair.policy.parts})
         make_folder(out.parent)
         with checkpoint.writing(out), folder_aside(out) as aside:
-            _copy(pair, aside)
+            policy_copy.copy(beside, pair.policy_at, aside)
             counted = told(rows.rows, "insert", len(pair.policy.specs), on_event)
             for part in pair.policy.parts:
                 place = aside / part.path.relative_to(pair.policy_at)
+                make_folder(place.parent)
                 tensor_files.write(place, part, counted)
             put(aside, out)
-    return _report(pair, rows, (str(out), vlm, policy))
+        _warn(pair, rows, beside, on_event)
+        return _report(pair, rows, (str(out), vlm, policy))
 
 
 class _Rows:
@@ -109,8 +111,10 @@ class _Rows:
             return before
         own = pair.vlm.rows(source, first, until)
         dtype = TYPES.get(pair.policy.specs[name].dtype)
-        written = own if dtype is None else checked_cast(own, dtype, source, self._called)
         shared = before[: until - first] if before.ndim else before
+        written = own
+        if dtype is not None:
+            written = checked_cast(own, dtype, shared, (source, self._called))
         if not torch.equal(written, shared):
             self.changed.add(name)
         if not torch.equal(written.to(own.dtype), own):
@@ -130,19 +134,33 @@ def _sources(pair: Pair) -> dict[str, str]:
     return found
 
 
-def _copy(pair: Pair, folder: Path) -> None:
-    """Copy everything in the policy's folder except its weights."""
-    weights = {part.path for part in pair.policy.parts}
+def _own_head(pair: Pair, rows: _Rows) -> tuple[str, str] | None:
+    """The policy's names of a head that the VLM lacks and of the table, if the two differ."""
+    second = pair.match.second
+    return None if second is None or second[0] in rows.source else second
 
-    def left_out(at: str, names: list[str]) -> list[str]:
-        inside = Path(at)
-        return [
-            name
-            for name in names
-            if inside / name in weights or (inside == pair.policy_at and name in _NOT_COPIED)
-        ]
 
-    shutil.copytree(pair.policy_at, folder, ignore=left_out, dirs_exist_ok=True)
+def _warn(pair: Pair, rows: _Rows, beside: Contents, on_event: OnEvent) -> None:
+    """Warn of what is in the new folder, or missing there, and may surprise."""
+    if (own := _own_head(pair, rows)) is not None:
+        text = (
+            f"'{own[0]}' stays as it was, since it differs from '{own[1]}', and the VLM has one "
+            "tensor for both: what the policy computes with it does not follow the VLM"
+        )
+        on_event(Warned("insert", text))
+    named = {*rows.source, *rows.source.values()}
+    if others := policy_copy.other_weights(beside, pair.policy_at, named):
+        text = (
+            "files that have tensors of the VLM's names, too, were copied unchanged: "
+            f"{few(list(map(str, others)))}"
+        )
+        on_event(Warned("insert", text))
+    if beside.stale:
+        text = (
+            "the state of the optimiser was not copied, since it belongs to the old weights: "
+            f"{few(list(map(str, beside.stale)))}"
+        )
+        on_event(Warned("insert", text))
 
 
 def _report(pair: Pair, rows: _Rows, named: tuple[str, str, str]) -> InsertReport:
@@ -172,6 +190,9 @@ def _report(pair: Pair, rows: _Rows, named: tuple[str, str, str]) -> InsertRepor
         for name, shared in found.rows.items()
         if shared < specs[name].shape[0]
     ]
+    if (head := _own_head(pair, rows)) is not None:
+        why = f"it stays as it was, since it differs from {head[1]}, to which the VLM ties it"
+        left_out.append(Share(head[0], why, 1, count(own[head[0]])))
     return InsertReport(
         out,
         vlm,

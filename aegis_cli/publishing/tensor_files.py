@@ -7,7 +7,7 @@ import json
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from io import BufferedReader
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import torch
@@ -15,7 +15,7 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from aegis_cli.common import files
-from aegis_cli.common.errors import AegisError
+from aegis_cli.common.errors import AegisError, few
 from aegis_cli.publishing.vlm_names import Spec
 
 TYPES = {
@@ -34,8 +34,8 @@ _WHOLE = {
     "BOOL": torch.bool,
 }
 _AT_ONCE = 2**26  # bytes of a tensor that are in memory at once
-_INDEX = "*.safetensors.index.json"
 _ONE = "model.safetensors"
+_INDEX = f"{_ONE}.index.json"
 
 
 @dataclass(frozen=True)
@@ -68,6 +68,8 @@ class Tensors:
     def rows(self, name: str, first: int, last: int) -> Tensor:
         """Rows of a tensor; a scalar is returned whole.
 
+        If PyTorch's type is not known here, each row is returned as its bytes.
+
         They are read and not memory-mapped, since mapped pages of a large model fill memory too.
 
         Raises:
@@ -84,7 +86,7 @@ class Tensors:
             raise AegisError(f"'{part.path}' has become shorter", "a complete file", _AGAIN)
         dtype = {**TYPES, **_WHOLE}.get(spec.dtype)
         if dtype is None:
-            return values
+            return values.view(last - first, a_row) if spec.shape else values
         shape = (last - first, *spec.shape[1:]) if spec.shape else ()
         return values.view(dtype).reshape(shape)
 
@@ -96,17 +98,36 @@ def paths(folder: Path) -> list[Path]:
     Mistral's repositories contain their weights twice.
 
     Raises:
-        AegisError: a file that the index names is missing.
+        AegisError: a file that the index names is missing or outside of the folder, or there are
+            several indices, none of which is the model's.
     """
-    found = sorted(folder.glob(_INDEX))
+    found = sorted(folder.glob("*.safetensors.index.json"))
+    # A variant, such as `model.fp16.safetensors.index.json`, may come first in the order of names.
+    if folder / _INDEX in found:
+        found = [folder / _INDEX]
     if found and not (folder / _ONE).is_file():
+        if len(found) > 1:
+            raise AegisError(
+                f"{len(found)} indices in '{folder}', none of them named {_INDEX}: "
+                f"{few([path.name for path in found])}",
+                "the index of one set of weights",
+                f"rename the one to read to {_INDEX}, or move the others elsewhere",
+            )
         index = files.load_json(found[0])
         listed = index.get("weight_map") if isinstance(index, dict) else None
         if not isinstance(listed, dict) or not listed:
             raise AegisError(
                 f"'{found[0]}' without a weight_map", "the index of files of weights", _AGAIN
             )
-        parts = [folder / name for name in sorted(set(map(str, listed.values())))]
+        names = sorted(set(map(str, listed.values())))
+        # The file of each name is also written, in the new folder.
+        if outside := [name for name in names if _leaves(name)]:
+            raise AegisError(
+                f"'{found[0]}' names a file outside of its folder: '{outside[0]}'",
+                "files of weights in the folder of their index",
+                f"move them there, and correct the index; if you do not know why it does, {_AGAIN}",
+            )
+        parts = [folder / name for name in names]
         if absent := [part for part in parts if not part.is_file()]:
             raise AegisError(
                 f"no file '{absent[0]}', which '{found[0].name}' names: {len(absent)} of "
@@ -118,6 +139,12 @@ def paths(folder: Path) -> list[Path]:
     if (folder / _ONE).is_file():
         return [folder / _ONE]
     return sorted(folder.glob("*.safetensors"))
+
+
+def _leaves(name: str) -> bool:
+    """Whether a relative name may lead out of the folder that it is looked up in."""
+    path = PurePosixPath(name)
+    return path.is_absolute() or ".." in path.parts
 
 
 _AGAIN = "download it again"
@@ -221,7 +248,7 @@ def blocks(spec: Spec) -> Iterator[tuple[int, int]]:
 
 
 def write(path: Path, part: TensorFile, rows: Callable[[str, int, int], Tensor]) -> None:
-    """Write a file with this header.
+    """Write a new file with this header.
 
     Args:
         rows: returns rows of a tensor, in the header's dtype; called for the tensors in order, each
@@ -233,16 +260,23 @@ def write(path: Path, part: TensorFile, rows: Callable[[str, int, int], Tensor])
             for first, last in blocks(spec):
                 yield rows(name, first, last).reshape(-1).view(torch.uint8).numpy().data
 
-    with open(path, "wb") as file:
+    with open(path, "xb") as file:
         file.write(part.head)
         files.pour(file, parts())
 
 
 def equal(tensors: Tensors, one: str, other: str) -> bool:
-    """Whether two tensors have the same shape, dtype and values."""
-    spec = tensors.specs[one]
-    if spec != tensors.specs[other]:
+    """Whether two tensors have the same shape and values.
+
+    If their floating-point types differ, the values are compared in the narrower one.
+    """
+    spec, second = tensors.specs[one], tensors.specs[other]
+    if spec != second and not (spec.shape == second.shape and spec.is_float and second.is_float):
         return False
-    return all(
-        torch.equal(tensors.rows(one, *part), tensors.rows(other, *part)) for part in blocks(spec)
-    )
+    narrow = TYPES.get(min(spec.dtype, second.dtype, key=_size))
+
+    def rows(name: str, part: tuple[int, int]) -> Tensor:
+        found = tensors.rows(name, *part)
+        return found if narrow is None else found.to(narrow)
+
+    return all(torch.equal(rows(one, part), rows(other, part)) for part in blocks(spec))

@@ -18,6 +18,8 @@ from aegis_cli.common.errors import AegisError, few
 # Parts of names that some releases of transformers have and others do not:
 # `language_model.model.layers.0`, `model.language_model.layers.0` and `model.layers.0` are one.
 _WRAPPERS = ("model", "language_model", "text_model")
+# Parts that torch.compile, checkpointing and sharding put before the names of what they wrap.
+_COMPILED = ("_orig_mod", "_checkpoint_wrapped_module", "_fsdp_wrapped_module")
 _LANGUAGE = ("embed_tokens", "layers", "norm", "lm_head")  # first parts of the text model's keys
 _LAYER = re.compile(r"layers\.(\d+)\.")
 TABLE, HEAD = "embed_tokens.weight", "lm_head.weight"
@@ -77,12 +79,15 @@ class Match:
 
 
 def key(name: str) -> str:
-    """One name for a tensor of a VLM, whichever release of transformers named it."""
+    """One name for a tensor of a VLM, whichever release of transformers named it.
+
+    It is the same if the tensor's module was compiled.
+    """
     found: list[str] = []
     for part in name.split("."):
         # As in CLIP and SigLIP until transformers 5.5.
         of_tower = part == "vision_model" and found[-1:] == ["vision_tower"]
-        if part not in _WRAPPERS and not of_tower:
+        if part not in (*_WRAPPERS, *_COMPILED) and not of_tower:
             found.append(part)
     return ".".join(found)
 
@@ -109,8 +114,8 @@ def match(base: Specs, policy: Specs, tied: bool, called: tuple[str, str]) -> Ma
         called: names of the policy and the VLM in errors.
 
     Raises:
-        AegisError: the policy does not have them, has them twice or in other shapes, or lacks more
-            of them than the layers after the last one that it computes.
+        AegisError: the policy does not have them, has them twice, in other shapes or not as plain
+            weights, or lacks more of them than the layers after the last one that it computes.
     """
     named = {key(name): name for name in base}
     if len(named) < len(base):
@@ -130,6 +135,7 @@ def match(base: Specs, policy: Specs, tied: bool, called: tuple[str, str]) -> Ma
     used = {*own.values(), *(second or ())}
     prefix = _common(used)  # includes a `model.` that keys ignore
     more = tuple(sorted(n for n in policy if n.startswith(prefix) and n not in used))
+    _check_plain(used, more, called)
     _check_depth(prefix, more, named, called)
     rows = {
         name: min(base[name].shape[0], policy[other].shape[0])
@@ -234,7 +240,7 @@ def _fits(
 
 def _alike(own: Spec, other: Spec, each: str) -> bool:
     """Whether a tensor of the policy can replace the VLM's."""
-    if own.is_float != other.is_float:
+    if own.dtype != other.dtype and not (own.is_float and other.is_float):
         return False
     if each in _OF_WORDS and own.shape and other.shape:
         return own.shape[1:] == other.shape[1:]
@@ -298,6 +304,17 @@ def _tie(
 def _check_shapes(
     base: Specs, policy: Specs, own: Mapping[str, str], called: tuple[str, str]
 ) -> None:
+    packed = [
+        f"{other} is {policy[other].dtype}"
+        for name, other in own.items()
+        if base[name].is_float and not policy[other].is_float
+    ]
+    if packed:
+        raise AegisError(
+            f"{len(packed)} of {len(own)} tensors of '{called[0]}' are quantised: {few(packed)}",
+            "weights in a floating-point type of 16 bits or more",
+            "dequantise the policy first, with the program that quantised it, and save it again",
+        )
     wrong = [
         f"{other} is {_said(policy[other])} instead of {_said(base[name])}"
         for name, other in own.items()
@@ -355,6 +372,27 @@ def _kept(
         ("buffers", "they do not learn", buffers),
     )
     return tuple(Kept(what, why, tuple(names)) for what, why, names in kinds if names)
+
+
+def _check_plain(used: Iterable[str], more: Iterable[str], called: tuple[str, str]) -> None:
+    """Raise AegisError if the modules of the VLM's weights have further tensors, as adapters do.
+
+    Then the weights alone are not what the policy computes with. A bias is only listed.
+    """
+    modules = {name.removesuffix("weight") for name in used if name.endswith(".weight")}
+    beside = []
+    for name in more:
+        parts = name.split(".")
+        above = ("".join(f"{part}." for part in parts[:end]) for end in range(1, len(parts)))
+        if parts[-1] != "bias" and any(each in modules for each in above):
+            beside.append(name)
+    if beside:
+        raise AegisError(
+            f"{len(beside)} tensors of adapters or scales beside the VLM's weights in "
+            f"'{called[0]}': {few(beside)}",
+            "plain weights",
+            "merge the adapter into the weights, or apply the scales, and save the policy again",
+        )
 
 
 def _check_depth(

@@ -56,6 +56,10 @@ def equal(one: Mapping[str, Tensor], other: Mapping[str, Tensor]) -> bool:
     return one.keys() == other.keys() and all(torch.equal(one[n], other[n]) for n in one)
 
 
+def warnings(said: list[Event]) -> list[str]:
+    return [event.text for event in said if isinstance(event, Warned)]
+
+
 def take(source: Path, base: Path, out: Path, **options: str) -> extract.ExtractReport:
     return extract.run(str(source), str(base), out, **options)
 
@@ -198,6 +202,34 @@ def test_a_vocabulary_of_another_length_shares_its_first_rows(
     assert files_of(tmp_path / "back") == files_of(source)
 
 
+def test_a_head_in_a_wider_type_follows_the_table(paligemma: Path, tmp_path: Path) -> None:
+    own = foreign.moved(paligemma)
+    own[TABLE] = own[TABLE].bfloat16()
+    source = policy(tmp_path / "policy", {**own, HEAD: own[TABLE].float()}, "pi0 of LeRobot")
+    report = take(source, paligemma, tmp_path / "vlm")
+    assert report.more == ()
+    insert.run(str(tmp_path / "vlm"), str(source), tmp_path / "same")
+    assert files_of(tmp_path / "same") == files_of(source)
+    back = insert.run(str(paligemma), str(source), tmp_path / "back")
+    name = "model.paligemma_with_expert.paligemma.lm_head.weight"
+    assert torch.equal(
+        load_file(tmp_path / "back" / WEIGHTS)[name], load_file(paligemma / WEIGHTS)[TABLE]
+    )
+    assert back.left_out == ()
+
+
+def test_a_head_that_stays_is_reported(paligemma: Path, tmp_path: Path) -> None:
+    own = foreign.moved(paligemma)
+    source = policy(tmp_path / "policy", {**own, HEAD: own[TABLE] + 1}, "pi0 of LeRobot")
+    said: list[Event] = []
+    back = insert.run(str(paligemma), str(source), tmp_path / "back", said.append)
+    name = "model.paligemma_with_expert.paligemma.lm_head.weight"
+    assert [(s.what, s.tensors, s.parameters) for s in back.left_out] == [
+        (name, 1, own[TABLE].numel())
+    ]
+    assert any(f"'{name}' stays as it was" in text for text in warnings(said))
+
+
 def test_tensors_are_the_same_however_few_rows_are_in_memory(
     paligemma: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -275,6 +307,61 @@ def test_a_base_in_shards_gives_its_shards_and_a_true_index(
     found = backbones.load(str(tmp_path / "vlm")).state_dict()
     take(source, paligemma, tmp_path / "one", dtype="bfloat16")
     assert equal(found, backbones.load(str(tmp_path / "one")).state_dict())
+
+
+def test_types_that_pytorch_alone_knows_are_copied_by_rows(
+    paligemma: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a table with fewer words, the first rows are the policy's and the others the base's."""
+    base = shutil.copytree(paligemma, tmp_path / "base")
+    stored = load_file(base / WEIGHTS)
+    stored[TABLE] = stored[TABLE].to(torch.float8_e4m3fn)
+    save_file(stored, base / WEIGHTS, {"format": "pt"})
+    own = {**foreign.moved(paligemma), TABLE: (stored[TABLE].float() + 1).to(torch.float8_e4m3fn)}
+    source = policy(tmp_path / "policy", {**own, TABLE: own[TABLE][:-5]}, "pi0 of openpi")
+    monkeypatch.setattr(tensor_files, "_AT_ONCE", 1000)
+    take(source, base, tmp_path / "vlm")
+    found = load_file(tmp_path / "vlm" / WEIGHTS)[TABLE].float()
+    expected = torch.cat([own[TABLE][:-5].float(), stored[TABLE][-5:].float()])
+    assert torch.equal(found, expected)
+    insert.run(str(tmp_path / "vlm"), str(source), tmp_path / "back")
+    assert files_of(tmp_path / "back") == files_of(source)
+
+
+def test_infinite_values_that_both_have_are_kept(paligemma: Path, tmp_path: Path) -> None:
+    base = shutil.copytree(paligemma, tmp_path / "base")
+    mask = {"vision_tower.mask": torch.tensor([0.0, -torch.inf])}
+    save_file({**load_file(base / WEIGHTS), **mask}, base / WEIGHTS, {"format": "pt"})
+    own = {**foreign.moved(paligemma), **mask}
+    source = policy(tmp_path / "policy", own, "pi0 of openpi")
+    take(source, base, tmp_path / "vlm")
+    assert equal(load_file(tmp_path / "vlm" / WEIGHTS), own)
+    insert.run(str(tmp_path / "vlm"), str(source), tmp_path / "back")
+    assert files_of(tmp_path / "back") == files_of(source)
+    worse = policy(tmp_path / "worse", {**own, **{n: -t for n, t in mask.items()}}, "pi0 of openpi")
+    with pytest.raises(AegisError, match="NaN or infinite"):
+        take(worse, base, tmp_path / "out")
+
+
+def test_shards_of_one_name_in_two_folders_stay_apart(paligemma: Path, tmp_path: Path) -> None:
+    base = shutil.copytree(paligemma, tmp_path / "base")
+    stored = load_file(base / WEIGHTS)
+    (base / WEIGHTS).unlink()
+    places = {
+        name: f"{('', 'more/')[i % 2]}part.safetensors" for i, name in enumerate(sorted(stored))
+    }
+    for place in set(places.values()):
+        (base / place).parent.mkdir(exist_ok=True)
+        part = {name: tensor for name, tensor in stored.items() if places[name] == place}
+        save_file(part, base / place, {"format": "pt"})
+    index = {"metadata": {}, "weight_map": places}
+    (base / f"{WEIGHTS}.index.json").write_text(json.dumps(index))
+    own = foreign.moved(paligemma)
+    take(policy(tmp_path / "policy", own, "pi0 of openpi"), base, tmp_path / "vlm")
+    parts = sorted((tmp_path / "vlm").rglob("part.safetensors"))
+    found = {name: tensor for part in parts for name, tensor in load_file(part).items()}
+    assert equal(found, own)
+    assert (tmp_path / "vlm" / f"{WEIGHTS}.index.json").is_file()
 
 
 # --- what others make of it -----------------------------------------------------------------------
@@ -358,6 +445,49 @@ def test_a_policy_comes_from_the_hub_by_its_id(
     assert equal(load_file(tmp_path / "vlm" / WEIGHTS), own) and report.type == "smolvla"
     insert.run("vlm", "somebody/smolvla", Path("back"))
     assert files_of(tmp_path / "back") == files_of(tmp_path / "sent")
+
+
+def test_the_state_of_an_optimiser_is_left_out(
+    smolvlm: Path, hub: Hub, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from huggingface_hub import constants
+
+    source = policy(tmp_path / "policy", foreign.moved(smolvlm), "smolvla")
+    before = files_of(source)
+    (source / "optimizer.pt").write_bytes(b"x")
+    (source / "training_state").mkdir()
+    (source / "training_state" / "optimizer_state.safetensors").write_bytes(b"x")
+    said: list[Event] = []
+    insert.run(str(smolvlm), str(source), tmp_path / "back", said.append)
+    assert files_of(tmp_path / "back").keys() == before.keys()
+    assert any("optimizer.pt, training_state" in text for text in warnings(said))
+    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "cache"))
+    monkeypatch.chdir(tmp_path)
+    hub.committed |= files_of(source)
+    extract.run("somebody/smolvla", str(smolvlm), Path("vlm"))
+    assert not [*tmp_path.glob("cache/**/optimizer*"), *tmp_path.glob("cache/**/training_state")]
+
+
+def test_the_index_of_a_variant_is_not_taken_for_the_models(
+    paligemma: Path, tmp_path: Path, bad: Callable[..., str]
+) -> None:
+    own = foreign.moved(paligemma)
+    source = policy(tmp_path / "policy", own, "pi0 of openpi", shards=2)
+    form = FORMS["pi0 of openpi"]
+    save_file(
+        {n: t.half() for n, t in foreign.tensors(own, form).items()},
+        source / "model.fp16-00001.safetensors",
+    )
+    variant = source / "model.fp16.safetensors.index.json"
+    places = dict.fromkeys(foreign.tensors(own, form), "model.fp16-00001.safetensors")
+    variant.write_text(json.dumps({"weight_map": places}))
+    take(source, paligemma, tmp_path / "vlm")
+    assert equal(load_file(tmp_path / "vlm" / WEIGHTS), own)
+    said: list[Event] = []
+    insert.run(str(paligemma), str(source), tmp_path / "back", said.append)
+    assert any("copied unchanged: model.fp16-00001.safetensors" in text for text in warnings(said))
+    (source / f"{WEIGHTS}.index.json").rename(source / "model.ema.safetensors.index.json")
+    assert "2 indices" in bad("extract", source, "--base", paligemma)
 
 
 # --- refused --------------------------------------------------------------------------------------
@@ -461,6 +591,101 @@ def test_nothing_that_is_there_is_written_over(
     one = source / WEIGHTS
     assert f"give '{source}'" in bad("insert", paligemma, "--into", one)
     assert files_of(source) == before
+
+
+@pytest.mark.parametrize("absolute", [True, False])
+def test_an_index_that_names_a_file_elsewhere_is_refused(
+    absolute: bool, paligemma: Path, tmp_path: Path, bad: Callable[..., str]
+) -> None:
+    source = policy(tmp_path / "policy", foreign.moved(paligemma), "pi0 of openpi", shards=2)
+    index, part = source / f"{WEIGHTS}.index.json", "model-00002-of-00002.safetensors"
+    place = (source / part).rename(tmp_path / "weights.safetensors")
+    before = place.read_bytes()
+    named = str(place) if absolute else "../weights.safetensors"
+    index.write_text(index.read_text().replace(part, named))
+    for command in (
+        ("insert", paligemma, "--into", source),
+        ("extract", source, "--base", paligemma),
+    ):
+        assert "names a file outside of its folder" in bad(*command)
+    assert place.read_bytes() == before
+
+
+def test_writing_never_replaces_a_file(paligemma: Path, tmp_path: Path) -> None:
+    path = tmp_path / WEIGHTS
+    path.write_text("mine")
+    with tensor_files.opened([paligemma / WEIGHTS]) as tensors, pytest.raises(FileExistsError):
+        tensor_files.write(path, tensors.parts[0], tensors.rows)
+    assert path.read_text() == "mine"
+
+
+def test_a_frozen_vlm_with_more_beside_it_may_have_learned(paligemma: Path, tmp_path: Path) -> None:
+    own = foreign.moved(paligemma, by=0)
+    more = {**own, "multi_modal_projector.scale": torch.ones(2)}
+    source = policy(tmp_path / "policy", more, "pi0 of LeRobot")
+    said: list[Event] = []
+    extract.run(str(source), str(paligemma), tmp_path / "vlm", on_event=said.append)
+    (text,) = warnings(said)
+    assert "nothing to forget" not in text and "multi_modal_projector.scale" in text
+
+
+def test_a_policy_that_is_read_only_gives_folders_that_are_not(
+    paligemma: Path, tmp_path: Path
+) -> None:
+    source = policy(tmp_path / "policy", foreign.moved(paligemma), "pi0 of openpi")
+    folders = (source, source / "assets")
+    try:
+        for folder in folders:
+            folder.chmod(0o555)
+        insert.run(str(paligemma), str(source), tmp_path / "back")
+    finally:
+        for folder in folders:
+            folder.chmod(0o755)
+    assert all(os.stat(tmp_path / "back" / at).st_mode & 0o700 == 0o700 for at in ("", "assets"))
+    assert files_of(tmp_path / "back").keys() == files_of(source).keys()
+
+
+def test_only_links_within_the_policy_are_followed(
+    paligemma: Path, tmp_path: Path, bad: Callable[..., str]
+) -> None:
+    source = policy(tmp_path / "policy", foreign.moved(paligemma), "pi0 of openpi")
+    (tmp_path / "secret").mkdir()
+    (tmp_path / "secret" / "key").write_text("mine")
+
+    def asked() -> str:
+        return bad("insert", paligemma, "--into", source)
+
+    link = source / "assets" / "link"
+    for target, said in {
+        tmp_path / "secret": "leads out of the policy's folder",
+        tmp_path / "secret" / "key": "leads out of the policy's folder",
+        tmp_path / "nowhere": "a broken link",
+        source: "a link to a folder that it lies in",
+    }.items():
+        link.symlink_to(target)
+        found = asked()
+        assert said in found and str(link) in found
+        link.unlink()
+    os.mkfifo(link)
+    assert "neither a file nor a folder" in asked()
+    link.unlink()
+    link.symlink_to("norm_stats.json")
+    (source / "again").symlink_to("assets")
+    insert.run(str(paligemma), str(source), tmp_path / "back")
+    assert (tmp_path / "back" / "again" / "link").read_text() == "{}"
+    assert not [path for path in (tmp_path / "back").rglob("*") if path.is_symlink()]
+
+
+def test_what_belongs_to_a_clone_or_a_download_is_not_copied(
+    paligemma: Path, tmp_path: Path
+) -> None:
+    source = policy(tmp_path / "policy", foreign.moved(paligemma), "pi0 of openpi")
+    before = files_of(source)
+    for name in (".git", ".cache", "assets/.git", "assets/.cache"):
+        (source / name).mkdir()
+        (source / name / "config").write_text("token")
+    insert.run(str(paligemma), str(source), tmp_path / "back")
+    assert files_of(tmp_path / "back").keys() == before.keys()
 
 
 def test_a_disk_that_is_full_leaves_nothing(

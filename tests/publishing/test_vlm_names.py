@@ -178,6 +178,75 @@ def test_what_only_the_policy_has_is_listed() -> None:
     assert "model.vlm.model.multi_modal_projector.scale" in match.more
 
 
+ADAPTERS = (
+    "lora_A.default.weight",
+    "lora_B",
+    "lora_magnitude_vector",
+    "adapter.down.weight",
+    "weight_scale_inv",
+)
+
+
+@pytest.mark.parametrize("generation", sorted(GENERATIONS))
+@pytest.mark.parametrize("adapter", ADAPTERS)
+def test_an_adapter_inside_of_a_module_is_refused(generation: str, adapter: str) -> None:
+    own = base()
+    module = "language_model.model.layers.1.self_attn.q_proj."
+    more = own | {module + adapter: Spec((4, WIDTH), "F32")}
+    with pytest.raises(AegisError, match="beside the VLM's weights") as caught:
+        found(own, policy(more, "model.vlm.", generation))
+    assert adapter in caught.value.found and "merge the adapter" in caught.value.fix
+
+
+def test_a_bias_that_the_base_does_not_have_is_listed() -> None:
+    own = base()
+    name = "language_model.model.layers.1.self_attn.q_proj.bias"
+    match = found(own, policy(own | {name: Spec((WIDTH,), "F32")}, "", "saved"))
+    assert name in match.more
+
+
+COMPILED = {
+    "language_model.model.": "language_model._orig_mod.model.",
+    "layers.1.": "layers.1._orig_mod.",
+    "vision_tower.": "vision_tower._orig_mod.",
+    "self_attn.": "self_attn._checkpoint_wrapped_module.",
+}
+
+
+@pytest.mark.parametrize("part", COMPILED)
+@pytest.mark.parametrize("generation", sorted(GENERATIONS))
+def test_names_of_compiled_parts_are_found(part: str, generation: str) -> None:
+    own = base()
+    named = {name: GENERATIONS[generation](name) for name in own}
+    if part == "language_model.model." and generation != "saved":
+        named = {
+            n: o.replace("language_model.", "language_model._orig_mod.") for n, o in named.items()
+        }
+    else:
+        named = {n: o.replace(part, COMPILED[part]) for n, o in named.items()}
+    match = found(own, {f"model.vlm.{named[name]}": spec for name, spec in own.items()})
+    assert match.taken == {name: f"model.vlm.{named[name]}" for name in own}
+
+
+@pytest.mark.parametrize("dtype", ["I8", "U8", "F8_E4M3"])
+def test_a_quantised_policy_is_refused_with_what_to_do(dtype: str) -> None:
+    own = base()
+    packed = {
+        name: Spec(spec.shape, dtype if "q_proj" in name else spec.dtype)
+        for name, spec in own.items()
+    }
+    with pytest.raises(AegisError, match="are quantised") as caught:
+        found(own, policy(packed, "model.", "modules"))
+    assert dtype in caught.value.found and "dequantise the policy first" in caught.value.fix
+
+
+def test_whole_numbers_of_another_type_are_refused() -> None:
+    own = base() | {"vision_tower.embeddings.position_ids": Spec((1, 9), "I64")}
+    other = own | {"vision_tower.embeddings.position_ids": Spec((1, 9), "I32")}
+    with pytest.raises(AegisError, match=r"I32 \[1, 9\] instead of I64"):
+        found(own, policy(other, "model.", "modules"))
+
+
 def test_two_copies_of_the_vlm_are_refused() -> None:
     own = base()
     other = policy(own, "net.", "modules") | policy(own, "ema.", "modules")
