@@ -396,6 +396,7 @@ def measure(
         if (begun := piece.begun()) is not None:
             recorder.restore(begun, model.device)
             done = begun.figures["done"]
+            del begun  # whose copy on the CPU takes as much memory as the sums
         with recorder.watch(), torch.enable_grad(), piece.going(recorder.kept) as passed:
             for part in passes.run(model, asked, batch_size, stage, on_event, ranks, done, passed):
                 # Questions about one image may share its graph: their words are drawn

@@ -44,11 +44,13 @@ def measure(
         return {name: t.to(model.device) for name, t in known.tensors.items()}
     parameters = dict(model.named_parameters())
     # In float64: the square of a gradient of 1e-25 is 0 in float32.
-    total = {name: torch.zeros_like(p, dtype=torch.float64) for name, p in parameters.items()}
-    before = 0
-    if (begun := piece.begun()) is not None:
+    if (begun := piece.begun()) is None:
+        total = {name: torch.zeros_like(p, dtype=torch.float64) for name, p in parameters.items()}
+        before = 0
+    else:
         total = {name: begun.tensors[name].to(p.device) for name, p in parameters.items()}
         before = begun.figures["done"]
+        del begun  # whose copy on the CPU takes as much memory
     rows = spread.rows(len(asked.questions), samples)
     on_event(Progress(_STAGE, before, samples, "samples"))
     with piece.going(lambda: Kept({}, total)) as passed:

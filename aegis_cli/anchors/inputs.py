@@ -381,6 +381,7 @@ def measure(
             if (begun := piece.begun()) is not None:
                 recorder.restore(begun, model.device)
                 done = begun.figures["done"]
+                del begun  # whose copy on the CPU takes as much memory as the sums
             with recorder.watch(None), piece.going(recorder.kept) as passed:
                 for _ in passes.run(model, asked, batch_size, stage, on_event, ranks, done, passed):
                     pass

@@ -3,6 +3,9 @@
 A piece is a part of the anchor, or one group of maps if a part is measured in groups. The first
 process saves the result of each finished piece. For the piece in progress, each process saves its
 own sums and how far they have come, at most once a minute and for at most a fiftieth of the time.
+Each of several processes also saves them once it has passed its share, and then waits for the
+others: they may have resumed from different positions.
+
 Resuming does not change the result: sums continue from exactly the same bits. Everything is removed
 when the anchor is written.
 """
@@ -50,6 +53,7 @@ class Work:
         self._ranks, self._on_event = ranks, on_event
         self._name = None if about is None else files.sha256_value(about)[:32]
         self._can_keep = about is not None
+        self._told_of_room = False
         if about is not None:
             cache.sweep(self._folder)
             files.sweep_all(self._folder)
@@ -60,9 +64,11 @@ class Work:
 
     def remove(self) -> None:
         """Remove all saved state of this anchor, once the anchor is written."""
-        if self._name is not None:
-            with contextlib.suppress(OSError):  # already removed, or not ours to remove
-                for path in self._folder.glob(f"{self._name}-*"):
+        if self._name is None:
+            return
+        with contextlib.suppress(OSError):  # the folder cannot be read
+            for path in self._folder.glob(f"{self._name}-*"):
+                with contextlib.suppress(OSError):  # already removed, or not ours to remove
                     path.unlink()
 
     # --- for its pieces ---------------------------------------------------------------------------
@@ -83,8 +89,11 @@ class Work:
             self.before_s += found.figures["seconds"]
         return found
 
-    def write(self, name: str, kept: Kept) -> bool:
+    def write(self, name: str, kept: Kept, writers: int = 1) -> bool:
         """Save something if the disk has room for it.
+
+        Args:
+            writers: number of processes on this machine that save as much at the same time.
 
         Returns:
             Whether it was saved.
@@ -95,7 +104,8 @@ class Work:
         try:
             files.make_folder(path.parent)
             free = shutil.disk_usage(path.parent).free
-            if kept.size * launch.local_world_size() > _OF_FREE * free:
+            if kept.size * writers > _OF_FREE * free:
+                self._tell_of_room(path.parent, kept.size * writers, free)
                 return False
             kept_tensors.write(path, kept)
         except (OSError, AegisError) as error:
@@ -105,6 +115,18 @@ class Work:
             fix = "set AEGIS_CACHE to a folder that can be written"
             self._on_event(Warned(_STAGE, f"{text}: {fix}"))
         return self._can_keep
+
+    def _tell_of_room(self, folder: Path, needed: int, free: int) -> None:
+        """Warn once that something is too large to be saved; smaller pieces still are."""
+        if self._told_of_room:
+            return
+        self._told_of_room = True
+        text = (
+            "what is measured is not kept, so that an interruption loses it: it takes "
+            f"{needed / 1e9:.3g} GB, more than a quarter of the {free / 1e9:.3g} GB that are free "
+            f"in '{folder}'. Set AEGIS_CACHE to a folder on a larger disk, or lower anchor.memory"
+        )
+        self._on_event(Warned(_STAGE, text))
 
     def forget(self, name: str) -> None:
         """Remove what is saved under this name."""
@@ -128,6 +150,7 @@ class Piece:
     stage: str
     _before_s: float = 0.0  # spent by earlier processes on the sums that this one continues
     _began_s: float = field(default_factory=time.monotonic)
+    _is_kept: bool = True  # whether the last save of the sums succeeded
 
     def finished(self) -> Kept | None:
         """The piece, if it is finished.
@@ -151,39 +174,62 @@ class Piece:
     def going(self, sums: Callable[[], Kept]) -> Generator[Callable[[int], None]]:
         """Save the sums regularly while the block runs, and when a signal ends it.
 
+        After the block, each of several processes waits here for the others.
+
         Args:
             sums: returns the current sums.
 
         Yields:
             A function to call, with how much is done, whenever the sums are consistent.
         """
-        if not self.work._can_keep:
+        if self.work._can_keep:
+            with self._saving(sums) as keep:
+                yield keep
+        else:
             yield lambda done: None
-            return
-        last, cost_s = time.monotonic(), 0.0
+        # One that resumed near its end may be hours ahead, and sums are added with a time limit. A
+        # signal that comes meanwhile is raised when the wait ends, also if another process ends it.
+        self.work._ranks.wait()
 
-        def keep(done: int) -> None:
-            nonlocal last, cost_s
+    @contextlib.contextmanager
+    def _saving(self, sums: Callable[[], Kept]) -> Generator[Callable[[int], None]]:
+        last, cost_s = time.monotonic(), 0.0
+        unsaved: int | None = None  # how much is done if it is more than what was last saved
+
+        def keep(done: int, at_once: bool = False) -> None:
+            nonlocal last, cost_s, unsaved
+            unsaved = done
             begun = time.monotonic()
-            if held.number is None and begun - last < _EVERY_S:
+            if not at_once and held.number is None and begun - last < _EVERY_S:
                 return
             found = sums()
             least_s = _TIMES * (cost_s or found.size / _BYTES_PER_S)
-            if held.number is not None or begun - last >= least_s:
-                self.work.write(self._own, self._timed(found, done=done))
+            if at_once or held.number is not None or begun - last >= least_s:
+                timed = self._timed(found, done=done)
+                self._is_kept = self.work.write(self._own, timed, launch.local_world_size())
                 last = time.monotonic()
                 cost_s = last - begun
+                unsaved = None
             if held.number is not None:
                 held.leave()
 
         with interrupts.deferred(self._tell_of_signal) as held:
             yield keep
+            # A process that waits for the others cannot save when a signal comes.
+            if unsaved is not None and (self.work._ranks.several or held.number is not None):
+                keep(unsaved, at_once=True)
 
     def _tell_of_signal(self) -> None:
-        text = (
-            "a signal came: the batch under way is finished, and what is measured so far is kept. "
-            "Another one ends this at once, without what came after it was last kept"
-        )
+        if self._is_kept:
+            text = (
+                "a signal came: the batch under way is finished, and what is measured so far is "
+                "kept. Another one ends this at once, without what came after it was last kept"
+            )
+        else:
+            text = (
+                "a signal came: the batch under way is finished, but what is measured of this part "
+                "is not kept. Another one ends this at once"
+            )
         self.work._on_event(Warned(_STAGE, text))
 
     def finish(self, kept: Kept) -> None:

@@ -272,6 +272,8 @@ def _about(
         "settings": model.settings(),
         "anchor": asdict(settings),
         "processes": ranks.count,
+        # Sums of a CPU are split among its threads, so their number decides how they are rounded.
+        "threads": torch.get_num_threads() if model.device.type == "cpu" else None,
         **ranks.by_first(lambda: {**read(), **circumstances.of_answers()}),
     }
 

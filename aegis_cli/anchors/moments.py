@@ -113,6 +113,7 @@ def measure_passes(
     if (begun := piece.begun()) is not None:
         recorder.restore(begun, model.device)
         done, before = begun.figures["samples"], begun.figures["done"]
+        del begun
 
     def sums() -> Kept:
         found = recorder.kept()

@@ -33,7 +33,9 @@ from aegis_cli.recipes.decoding import below
 # What is added to a command to resume it; `run` skips stages that are up to date.
 _WITH_RESUME = {"train": " --resume", "pretrain": " --resume", "run": ""}
 _KEEPS = {  # what other commands do not measure again, if the cache can be written
-    "anchor": "all but the last of what is measured so far is kept",
+    "anchor": (
+        "all but the last of what is measured so far is kept, unless a warning says otherwise"
+    ),
     "evaluate": "predictions so far are kept",
     "merge": "the strengths so far are kept",
     "probe": "answers so far are kept",

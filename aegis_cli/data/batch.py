@@ -92,7 +92,11 @@ def _by_dimension(rows: Tensor, measure: Callable[[Tensor], Tensor]) -> Tensor:
 
     One column at a time: float64 copies of millions of rows would take gigabytes.
     """
-    return torch.stack([measure(column.double()) for column in rows.unbind(1)])
+    found = [measure(column.double()) for column in rows.unbind(1)]
+    if not found:  # rows without dimensions, whose result has none either
+        one = measure(torch.zeros(1, dtype=torch.float64, device=rows.device))
+        return one.new_empty(0, *one.shape)
+    return torch.stack(found)
 
 
 def _deviation(column: Tensor) -> Tensor:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import signal
+import weakref
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ import pytest
 import torch
 from samples import processes
 from samples.kept_anchors import go_on_there
-from samples.parallel_runs import MeasuringAgain, run_together
+from samples.parallel_runs import MeasuringAgain, Waiting, run_together
 from samples.second_device import POSSIBLE
 from samples.tiny import make_tiny
 from samples.vqa_files import picture, write_jsonl
@@ -24,6 +25,7 @@ from aegis_cli.anchors.second_moments import SecondMoments
 from aegis_cli.common import cache, kept_tensors, version
 from aegis_cli.common.events import Event, OnEvent, Progress, Warned, ignore
 from aegis_cli.common.kept_tensors import Kept
+from aegis_cli.common.ranks import Ranks
 from aegis_cli.core import moment_sums
 from aegis_cli.recipes import ANCHOR_PARTS
 from aegis_cli.recipes import Anchor as Settings
@@ -286,7 +288,50 @@ def test_what_has_no_room_on_the_disk_is_not_kept(
     monkeypatch.setattr(kept_work.shutil, "disk_usage", lambda _: _Usage(1000))
     assert interrupted(run, monkeypatch, -1) == 0
     assert run(ALL, events.append) == whole
-    assert not any(isinstance(event, Warned) and "kept" in event.text for event in events)
+    told = [event.text for event in events if isinstance(event, Warned) and "kept" in event.text]
+    assert len(told) == 1 and "AEGIS_CACHE" in told[0] and "anchor.memory" in told[0]
+    assert "not kept" in told[0] and "1e-06 GB that are free" in told[0]
+
+
+def test_a_signal_does_not_promise_to_keep_what_has_no_room(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(kept_work.shutil, "disk_usage", lambda _: _Usage(1000))
+    events: list[Event] = []
+
+    def end(event: Event) -> None:
+        events.append(event)
+        if isinstance(event, Progress) and event.stage == "anchor fisher" and event.done:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    with pytest.raises(KeyboardInterrupt):
+        run(dataclasses.replace(ALL, parts=("fisher",)), end)
+    told = str([event.text for event in events if isinstance(event, Warned)])
+    assert "of this part is not kept" in told and "so far is kept" not in told
+
+
+@pytest.mark.parametrize(("processes_here", "free"), [(1, 4000), (4, 16000)])
+def test_the_disk_needs_room_for_the_sums_of_each_process_and_for_one_result(
+    monkeypatch: pytest.MonkeyPatch, processes_here: int, free: int
+) -> None:
+    """A quarter of the free disk holds exactly 1,000 bytes of each."""
+    monkeypatch.setenv("LOCAL_WORLD_SIZE", str(processes_here))
+
+    def write(bytes_free: int) -> tuple[bool, bool]:
+        """Whether sums are kept, and whether the result is."""
+        monkeypatch.setattr(kept_work.shutil, "disk_usage", lambda _: _Usage(bytes_free))
+        work = Work({"free": bytes_free})
+        piece = work.piece("anchor")
+        thousand = Kept({}, {"x": torch.zeros(1000, dtype=torch.uint8)})
+        with piece.going(lambda: thousand) as passed:
+            passed(1)
+        sums = piece.begun() is not None
+        piece.finish(thousand)
+        return sums, piece.finished() is not None
+
+    assert write(free) == (True, True)
+    assert write(free - 1) == (False, processes_here > 1)
+    assert write(3999) == (False, False)
 
 
 @dataclasses.dataclass
@@ -318,6 +363,114 @@ def test_several_processes_go_on_each_with_its_own_sums(tiny_folder: Path, tmp_p
     found = [(tmp_path / name / "anchor.safetensors").read_bytes() for name in names]
     assert all(one == found[0] for one in found)
     assert not list((kept_in / "anchors").iterdir())
+
+
+def test_processes_wait_for_each_other_longer_than_for_a_sum(
+    tiny_folder: Path, tmp_path: Path
+) -> None:
+    settings = dataclasses.replace(ALL, parts=("fisher",))
+    run_together(2, [Waiting(tiny_folder, tmp_path / "out", settings, limit_s=5, late_s=8)])
+    assert (tmp_path / "out" / "anchor.safetensors").is_file()
+
+
+@pytest.mark.parametrize("about", [{"an": "anchor"}, None])
+def test_each_of_several_processes_saves_its_sums_and_then_waits(
+    monkeypatch: pytest.MonkeyPatch, about: dict[str, str] | None
+) -> None:
+    monkeypatch.setattr(kept_work, "_EVERY_S", 1e9)
+    piece = Work(about, Ranks(1, 2)).piece("anchor")
+    found: list[Kept | None] = []
+    monkeypatch.setattr(Ranks, "wait", lambda _: found.append(piece.begun()))
+    with piece.going(lambda: Kept({}, {"x": torch.ones(3)})) as passed:
+        passed(1)
+        passed(2)
+        assert not found and piece.begun() is None
+    (saved,) = found
+    assert (None if saved is None else saved.figures["done"]) == (2 if about else None)
+
+
+def test_a_process_that_fails_does_not_wait_for_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Ranks, "wait", lambda _: pytest.fail("it waits"))
+    piece = Work({"an": "anchor"}, Ranks(1, 2)).piece("anchor")
+    with pytest.raises(ValueError), piece.going(lambda: Kept({})):
+        raise ValueError
+
+
+def test_a_signal_after_the_last_batch_keeps_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(kept_work, "_EVERY_S", 1e9)
+    piece = Work({"an": "anchor"}).piece("anchor")
+    with (
+        pytest.raises(KeyboardInterrupt),
+        piece.going(lambda: Kept({}, {"x": torch.ones(3)})) as passed,
+    ):
+        passed(1)
+        os.kill(os.getpid(), signal.SIGINT)
+    saved = piece.begun()
+    assert saved is not None and saved.figures["done"] == 1
+
+
+@pytest.mark.parametrize("part", ANCHOR_PARTS)
+def test_saved_sums_are_in_memory_once(
+    run: Run, monkeypatch: pytest.MonkeyPatch, part: str
+) -> None:
+    """What was read is released before the first pass, and no other sums are allocated."""
+    settings = dataclasses.replace(ALL, parts=(part,))
+    interrupted(run, monkeypatch, 2, settings)
+    read: list[weakref.ref[Kept]] = []
+    allocated: list[torch.Size] = []
+    begun, going, zeros = kept_work.Piece.begun, kept_work.Piece.going, torch.zeros_like
+
+    def note(piece: kept_work.Piece) -> Kept | None:
+        found = begun(piece)
+        if found is not None:
+            read.append(weakref.ref(found))
+        return found
+
+    def go(piece: kept_work.Piece, sums: Callable[[], Kept]) -> Any:
+        assert not allocated and not any(one() for one in read)
+        return going(piece, sums)
+
+    def zeros_like(x: torch.Tensor, **options: Any) -> torch.Tensor:
+        if options.get("dtype") is torch.float64:
+            allocated.append(x.shape)
+        return zeros(x, **options)
+
+    monkeypatch.setattr(kept_work.Piece, "begun", note)
+    monkeypatch.setattr(kept_work.Piece, "going", go)
+    monkeypatch.setattr(torch, "zeros_like", zeros_like)
+    run(settings)
+    assert len(read) == 1
+
+
+def test_another_number_of_threads_takes_nothing(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = dataclasses.replace(ALL, parts=("moments",))
+    interrupted(run, monkeypatch, 3, settings)
+    before = torch.get_num_threads()
+    torch.set_num_threads(before + 1)
+    try:
+        _, begun = begun_at(run, settings)
+    finally:
+        torch.set_num_threads(before)
+    assert begun and not any(begun.values())
+
+
+def test_what_cannot_be_removed_does_not_keep_the_rest(monkeypatch: pytest.MonkeyPatch) -> None:
+    work = Work({"an": "anchor"})
+    for stage in ("anchor", "anchor fisher", "anchor inputs"):
+        work.piece(stage).finish(Kept({}))
+    assert len(kept()) == 3
+    plain, refused = Path.unlink, list[Path]()
+
+    def unlink(path: Path, **options: Any) -> None:
+        if not refused:
+            refused.append(path)
+            raise PermissionError
+        plain(path, **options)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "unlink", unlink)
+        work.remove()
+    assert kept() == refused
 
 
 @pytest.mark.skipif(not POSSIBLE, reason="this torch takes no device of others' making")

@@ -861,7 +861,7 @@ def test_ctrl_c_exits_130_and_says_how_to_resume(aegis, stage, recipe):
         said = aegis(command, "r")[2]
         assert f"interrupted; {kept}" in said and said.endswith(f"go on with: aegis {command} r\n")
     said = aegis("anchor", "--out", "x")[2]
-    kept = "all but the last of what is measured so far is kept"
+    kept = "all but the last of what is measured so far is kept, unless a warning says otherwise"
     assert said.endswith(f"interrupted; {kept}; go on with: aegis anchor --out x\n")
     whole = "interrupted; no half-written file is left; begin again with: aegis"
     assert aegis("demos", "reach", "--out", "x")[2].endswith(f"{whole} demos reach --out x\n")

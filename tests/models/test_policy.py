@@ -9,7 +9,7 @@ import torch
 from samples.training import CHUNK, INSTRUCTIONS, adapt, gradients, images, make_policy, robot_batch
 from torch import Tensor
 
-from aegis_cli.data.batch import Normalizer
+from aegis_cli.data.batch import Normalizer, deviations
 from aegis_cli.methods import METHODS
 from aegis_cli.models import flow
 from aegis_cli.models.policy import Policy
@@ -54,6 +54,16 @@ def test_a_dimension_that_never_varied_is_only_centred_and_keeps_its_value(
     assert (predicted[:, 0] == scale.mean[0]).all() and predicted[:, 1].std() > 0.1
     # sensor noise a thousand times larger than any seen before is still a small input
     assert scale(rows + 1e-3)[:, 0].abs().max() < 0.01
+
+
+@pytest.mark.parametrize("fit", [Normalizer.fit, Normalizer.fit_quantiles])
+def test_rows_without_dimensions_have_scales_without_any(
+    fit: Callable[[Tensor], Normalizer],
+) -> None:
+    rows = torch.zeros(20, 0)
+    scale = fit(rows)
+    assert scale.mean.shape == scale.std.shape == deviations(rows).shape == (0,)
+    assert scale(rows).shape == scale.invert(rows).shape == (20, 0)
 
 
 @pytest.mark.parametrize("unit", [1.0, 1e-3, 1e-5])

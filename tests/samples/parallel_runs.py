@@ -7,8 +7,11 @@ import io
 import os
 import random
 import socket
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from datetime import timedelta
+from functools import partial
 from pathlib import Path
 from typing import Protocol
 
@@ -188,6 +191,44 @@ class MeasuringAgain:
         if self.lost and launch.rank():
             for path in own:
                 path.unlink()
+
+
+@dataclass(frozen=True)
+class Waiting:
+    """An anchor of moments or Fisher information, each of which the last process begins late.
+
+    The others seem to have resumed further on.
+
+    Attributes:
+        limit_s: how long a process waits for the others' share of a sum.
+        late_s: how late it is.
+    """
+
+    model: Path
+    out: Path
+    settings: Anchor
+    limit_s: float
+    late_s: float
+
+    def run(self) -> None:
+        """Measure here, alone or with the processes that the environment describes."""
+        self.out.mkdir(exist_ok=True, parents=True)
+        late = set[str]()
+
+        def wait(event: Event) -> None:
+            if not isinstance(event, Progress) or event.unit != "samples" or not launch.rank():
+                return
+            if event.stage not in late:
+                late.add(event.stage)
+                time.sleep(self.late_s)
+
+        plain = torch.distributed.init_process_group
+        limited = partial(plain, timeout=timedelta(seconds=self.limit_s))
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setenv("AEGIS_CACHE", str(self.out / "cache"))
+            patch.setattr(torch.distributed, "init_process_group", limited)
+            measure.run(str(self.model), self.settings, self.out / "anchor.safetensors", wait)
+        assert len(late) == (len(self.settings.parts) if launch.rank() else 0)
 
 
 @dataclass(frozen=True)
