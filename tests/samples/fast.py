@@ -34,7 +34,6 @@ FILES = (
     "models/test_expert.py",
     "models/test_flow.py",
     "models/test_policy.py",
-    "publishing/test_vlm_names.py",
     "reporting/test_compare.py",
     "serving/test_wire.py",
     "sim/test_planner.py",
