@@ -1331,9 +1331,10 @@ def insert(
 ) -> None:
     """Put a VLM back into a robot policy that another program trained, as a new folder.
 
-    The folder has all that the policy's has. The VLM's tensors stand under the policy's names, in
-    its types; what the policy does not have is left out. What aegis extract took out gives the
-    same weights again, unless --dtype or the base's type has rounded them.
+    The policy's other files are copied, but for .git, .cache and the optimiser's state. The VLM's
+    tensors stand under the policy's names, in its types; what the policy does not have is left out.
+    What aegis extract took out gives the same weights again, unless --dtype or the base's type has
+    rounded them.
 
     \b
     Example: aegis insert merged --into pretrained_model --out policy

@@ -148,12 +148,13 @@ class _Counted:
         if until <= first:
             return before if dtype is None else before.to(dtype)
         own = pair.policy.rows(pair.match.taken[name], first, until)
-        shared = before[: until - first] if before.ndim else before
-        if not torch.equal(own, shared.to(own.dtype)):
+        same = before[: until - first] if before.ndim else before
+        if not torch.equal(own, same.to(own.dtype)):
             self.moved.add(name)
         written = own
         if dtype is not None:
-            written = checked_cast(own, dtype, shared, (pair.match.taken[name], self._called[0]))
+            named = pair.match.taken[name], self._called[0]
+            written = checked_cast(own, dtype, same, named, "extract with --dtype float32")
         if not torch.equal(written.to(own.dtype), own):
             self.rounded.add(name)
         if until < last:
@@ -161,12 +162,15 @@ class _Counted:
         return written
 
 
-def checked_cast(own: Tensor, dtype: torch.dtype, other: Tensor, named: tuple[str, str]) -> Tensor:
+def checked_cast(
+    own: Tensor, dtype: torch.dtype, other: Tensor, named: tuple[str, str], fix: str
+) -> Tensor:
     """A tensor in another dtype.
 
     Args:
         other: the same tensor of the other model, which may have infinite values too, as masks do.
         named: the tensor's name, and that of its model.
+        fix: what to do about numbers that the dtype is too small for.
 
     Raises:
         AegisError: numbers that are not finite, before or after the conversion.
@@ -180,7 +184,7 @@ def checked_cast(own: Tensor, dtype: torch.dtype, other: Tensor, named: tuple[st
         raise AegisError(
             f"'{name}' of '{called}' has numbers that {said} is too small for",
             "a type that holds them",
-            "extract with --dtype float32",
+            fix,
         )
     if torch.equal(own, other.to(own.dtype)):
         return written
@@ -266,21 +270,7 @@ def _report(
     out, policy, base = named
     stored = {types[name] for name, spec in specs.items() if spec.is_float}
     long = {short: long for long, short in NAMES.items()}
-    shared = {name: _shared(specs[name], found.rows.get(name)) for name in found.taken}
-    kept = [
-        Share(each.what, each.why, len(each.names), sum(count(specs[n]) for n in each.names))
-        for each in found.kept
-    ]
-    kept += [
-        Share(
-            f"the last {specs[name].shape[0] - rows:,} rows of {name}",
-            "the policy's vocabulary ends before them",
-            0,
-            count(specs[name]) - shared[name],
-        )
-        for name, rows in found.rows.items()
-        if rows < specs[name].shape[0]
-    ]
+    taken = {name: shared(specs[name], found.rows.get(name)) for name in found.taken}
     return ExtractReport(
         out,
         policy,
@@ -291,13 +281,33 @@ def _report(
         len(specs),
         sum(map(count, specs.values())),
         len(found.taken),
-        sum(shared.values()),
+        sum(taken.values()),
         len(counted.moved),
-        sum(shared[name] for name in counted.moved),
+        sum(taken[name] for name in counted.moved),
         len(counted.rounded),
-        tuple(kept),
+        tuple(lacking(pair)),
         _more(pair),
     )
+
+
+def lacking(pair: Pair, why: str | None = None) -> list[Share]:
+    """The VLM's tensors, and rows of its tables, that the policy does not have.
+
+    Args:
+        why: the reason to give for whole tensors; None: what that means for their training.
+    """
+    found, specs = pair.match, pair.vlm.specs
+    shares = []
+    for each in found.kept:
+        parameters = sum(count(specs[name]) for name in each.names)
+        shares.append(Share(each.what, why or each.why, len(each.names), parameters))
+    for name, rows in found.rows.items():
+        left = specs[name].shape[0] - rows
+        if left > 0:
+            parameters = count(specs[name]) - shared(specs[name], rows)
+            what = f"the last {left:,} rows of {name}"
+            shares.append(Share(what, "the policy's vocabulary ends before them", 0, parameters))
+    return shares
 
 
 def _more(pair: Pair) -> tuple[str, ...]:
@@ -319,7 +329,7 @@ def count(spec: Spec) -> int:
     return math.prod(spec.shape)
 
 
-def _shared(spec: Spec, rows: int | None) -> int:
+def shared(spec: Spec, rows: int | None) -> int:
     """How many numbers of a tensor are in its first rows."""
     return count(spec) if rows is None else rows * count(spec) // max(1, spec.shape[0])
 

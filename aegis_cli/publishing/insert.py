@@ -13,7 +13,15 @@ from aegis_cli.common.errors import AegisError, few
 from aegis_cli.common.events import OnEvent, Warned, ignore
 from aegis_cli.common.files import folder_aside, make_folder, put
 from aegis_cli.publishing import foreign_policy, policy_copy, tensor_files
-from aegis_cli.publishing.extract import Share, check_new, checked_cast, count, told
+from aegis_cli.publishing.extract import (
+    Share,
+    check_new,
+    checked_cast,
+    count,
+    lacking,
+    shared,
+    told,
+)
 from aegis_cli.publishing.foreign_policy import Pair
 from aegis_cli.publishing.policy_copy import Contents
 from aegis_cli.publishing.tensor_files import TYPES
@@ -111,11 +119,12 @@ class _Rows:
             return before
         own = pair.vlm.rows(source, first, until)
         dtype = TYPES.get(pair.policy.specs[name].dtype)
-        shared = before[: until - first] if before.ndim else before
+        same = before[: until - first] if before.ndim else before
         written = own
         if dtype is not None:
-            written = checked_cast(own, dtype, shared, (source, self._called))
-        if not torch.equal(written, shared):
+            fix = "store the policy in bfloat16 or float32, and insert into that"
+            written = checked_cast(own, dtype, same, (source, self._called), fix)
+        if not torch.equal(written, same):
             self.changed.add(name)
         if not torch.equal(written.to(own.dtype), own):
             self.rounded.add(name)
@@ -164,32 +173,10 @@ def _warn(pair: Pair, rows: _Rows, beside: Contents, on_event: OnEvent) -> None:
 
 
 def _report(pair: Pair, rows: _Rows, named: tuple[str, str, str]) -> InsertReport:
-    found, own, specs = pair.match, pair.policy.specs, pair.vlm.specs
+    found, own = pair.match, pair.policy.specs
     out, vlm, policy = named
-    put_parameters = 0
-    for name, source in rows.source.items():
-        whole = count(own[name])
-        shared = found.rows.get(source)
-        put_parameters += whole if shared is None else shared * whole // max(1, own[name].shape[0])
-    left_out = [
-        Share(
-            each.what,
-            "the policy does not have it",
-            len(each.names),
-            sum(count(specs[name]) for name in each.names),
-        )
-        for each in found.kept
-    ]
-    left_out += [
-        Share(
-            f"the last {specs[name].shape[0] - shared:,} rows of {name}",
-            "the policy's vocabulary ends before them",
-            0,
-            count(specs[name]) * (specs[name].shape[0] - shared) // specs[name].shape[0],
-        )
-        for name, shared in found.rows.items()
-        if shared < specs[name].shape[0]
-    ]
+    put_rows = {name: found.rows.get(source) for name, source in rows.source.items()}
+    left_out = lacking(pair, "the policy does not have it")
     if (head := _own_head(pair, rows)) is not None:
         why = f"it stays as it was, since it differs from {head[1]}, to which the VLM ties it"
         left_out.append(Share(head[0], why, 1, count(own[head[0]])))
@@ -201,7 +188,7 @@ def _report(pair: Pair, rows: _Rows, named: tuple[str, str, str]) -> InsertRepor
         len(own),
         sum(map(count, own.values())),
         len(rows.source),
-        put_parameters,
+        sum(shared(own[name], taken) for name, taken in put_rows.items()),
         len(rows.changed),
         len(rows.rounded),
         tuple(left_out),

@@ -5,7 +5,7 @@
     pip install -e '.[hf]' -e plugins/lerobot_policy_aegis -e plugins/lerobot_env_aegis
     python plugins/check/check.py
 
-It takes about twelve minutes of two cores, and is no part of the tests.
+It takes about ten minutes of two cores, and is no part of the tests.
 """
 
 from __future__ import annotations

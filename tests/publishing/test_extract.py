@@ -343,6 +343,23 @@ def test_infinite_values_that_both_have_are_kept(paligemma: Path, tmp_path: Path
         take(worse, base, tmp_path / "out")
 
 
+def test_numbers_that_the_policys_type_cannot_hold_are_refused(
+    smolvlm: Path, tmp_path: Path
+) -> None:
+    """Each command says what to do about its own output."""
+    half = {name: t.half() for name, t in foreign.moved(smolvlm).items()}
+    source = policy(tmp_path / "policy", half, "smolvla")
+    large = Path(shutil.copytree(smolvlm, tmp_path / "large"))
+    found = load_file(large / "model.safetensors")
+    name = next(name for name in found if name.endswith("q_proj.weight"))
+    found[name] = found[name] + 1e6  # float16 ends at 65,504
+    save_file(found, large / "model.safetensors", {"format": "pt"})
+    with pytest.raises(AegisError, match="float16 is too small") as caught:
+        insert.run(str(large), str(source), tmp_path / "out")
+    assert "store the policy in bfloat16 or float32" in caught.value.fix
+    assert not (tmp_path / "out").exists()
+
+
 def test_shards_of_one_name_in_two_folders_stay_apart(paligemma: Path, tmp_path: Path) -> None:
     base = shutil.copytree(paligemma, tmp_path / "base")
     stored = load_file(base / WEIGHTS)
