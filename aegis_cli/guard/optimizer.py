@@ -25,6 +25,7 @@ from aegis_cli.guard import matching, wide_step
 from aegis_cli.guard.options import load_anchor, method_options
 from aegis_cli.guard.stepper import SlowedStep, overflowed
 from aegis_cli.guard.wide_step import WideStep
+from aegis_cli.methods import kfac
 from aegis_cli.methods.base import MethodContext, Parts
 from aegis_cli.methods.site_weights import weights
 from aegis_cli.methods.stepper import Stepper
@@ -77,6 +78,10 @@ class ProtectedAdamW(torch.optim.AdamW):
             expected = f"one of {', '.join(CONSTRAINING)}"
             raise AegisError(f"method '{method}'", expected, "choose another optimizer")
         self._method, self._options = method, method_options(method, {**options, "every": 1})
+        if method == "kfac":
+            rate = float(self.defaults["lr"])
+            if why := kfac.why_strong(self._options["weight"], rate, "--optimizer.weight"):
+                _log.warning(why)
         self._anchor, header = load_anchor(method, Path(anchor))
         if header.fingerprint != base.fingerprint():
             raise AegisError(

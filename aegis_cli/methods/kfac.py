@@ -1,12 +1,16 @@
 """A proximal penalty with the Kronecker-factored curvature of the answers to VQA, map by map.
 
 It takes the proximal step of (w / 2) sum_ij h_ij (W - W0)_ij^2 in the eigenbases of the two factors
-of K-FAC (arXiv 1503.05671; see core/curvature.py). This is elastic weight consolidation with a
-Kronecker-factored Fisher information instead of a diagonal one (structured Laplace, Ritter et al.
-2018, arXiv 1805.07810), applied to the weights as AdamW applies its decay, not to a gradient that
-Adam would rescale. It differs from `nullspace` in two ways: directions that VQA reads but that do
-not change its answers are freer, and it acts on the whole displacement since the start, so that
-changes which the loss does not keep demanding are undone.
+of K-FAC (arXiv 1503.05671; see core/curvature.py). Within one map this is elastic weight
+consolidation with a Kronecker-factored Fisher information instead of a diagonal one (structured
+Laplace, Ritter et al. 2018, arXiv 1805.07810). Across maps it is not: each map's curvature is
+divided by its own mean, so every map is pulled equally hard. The step acts on the weights and not
+on a gradient that Adam would rescale. It differs from `nullspace` in two ways: directions that VQA
+reads but that do not change its answers are freer, and it acts on the whole displacement since the
+start, so that changes which the loss does not keep demanding are undone.
+
+Unlike AdamW's decay, the weight is not multiplied by the learning rate. If each step moves a
+direction by the rate, the pull and the steps balance at a displacement of rate / (w h).
 
 Between two proximal steps the steepest directions drift, and the loss is computed at drifted
 weights: a lower `every` lets them drift less and costs more. Normalisations, tables and lone rows
@@ -16,7 +20,7 @@ Two options measure what that choice is worth. `step: gradient` adds the penalty
 task gradient instead, as elastic weight consolidation does. `growth` lets the weight grow as the
 learning rate falls from its peak, weight (peak / rate)^growth. Even with a constant weight, the
 proximal step gains on the optimizer's steps as these get shorter; `growth` sets how much more it
-does.
+does, and with -1 it does not: the weight falls with the rate.
 
 `balance` undoes one effect of Adam. Its updates have the same size in every tensor, however small
 the tensor's gradient, so a map with little to learn moves as far as the others, driven by noise,
@@ -46,6 +50,8 @@ from aegis_cli.methods.base import Method, MethodContext, Options, Parts, Update
 from aegis_cli.methods.site_weights import pair_here, stackable, weights
 
 _LEAST_RATE = 1e-6  # fraction of the peak learning rate
+# The weight over the learning rate: in most of our studies, and where little is left to learn.
+_STUDIED, _STRONG = 15, 500
 
 
 def adapt(backbone: nn.Module, _: Mapping[str, nn.Linear], __: Options) -> None:
@@ -78,6 +84,23 @@ def start(context: MethodContext) -> Parts:
         constrain=_constrain(groups, weight, options["growth"]),
         compares=False,  # the start is the reference, so no weights are copied per step
         every=options["every"],
+    )
+
+
+def why_strong(weight: float, rate: float, option: str) -> str | None:
+    """Why the backbone may learn little with a weight at a learning rate; None if it is usual.
+
+    Args:
+        option: how a user sets the weight, such as `--set kfac.weight`.
+    """
+    if weight <= _STRONG * rate:
+        return None
+    times = f"{weight / rate:,.0f} times the backbone's learning rate {rate:g}"
+    return (
+        f"the weight of kfac, {weight:g}, is {times}, so the backbone may learn little, however "
+        f"long it trains: a direction of mean curvature moves at most about rate / weight, "
+        f"{rate / weight:.2g}. Most of our studies have {_STUDIED} times the rate: "
+        f"{option}={_STUDIED * rate:.2g}"
     )
 
 

@@ -113,12 +113,12 @@ def _method_checks(recipe: Recipe) -> Iterator[Problem]:
             found = f"kfac.{name}: {getattr(kfac, name):g} with kfac.step: gradient"
             yield Problem(found, "kfac.step: proximal, which it belongs to", f"delete kfac.{name}")
     fix = "delete kfac.growth"
-    if train.schedule == CONSTANT and kfac.growth > 0:
+    if train.schedule == CONSTANT and kfac.growth != 0:
         found = f"kfac.growth: {kfac.growth:g} with train.schedule: {CONSTANT}"
-        yield Problem(found, "learning rates that fall, as it grows", fix)
-    elif train.final_lr_share == 1 and kfac.growth > 0:
+        yield Problem(found, "learning rates that fall", fix)
+    elif train.final_lr_share == 1 and kfac.growth != 0:
         found = f"kfac.growth: {kfac.growth:g} with train.final_lr_share: 1"
-        yield Problem(found, "learning rates that fall, as it grows", fix)
+        yield Problem(found, "learning rates that fall", fix)
 
 
 def _train_checks(train: Train) -> Iterator[Problem]:

@@ -9,6 +9,7 @@ from aegis_cli.data import renaming
 from aegis_cli.data.selection import Selection
 from aegis_cli.data.vqa.gate import MEAN, UPPER
 from aegis_cli.recipes.keys import (
+    AT_LEAST_MINUS_ONE,
     BELOW_ONE,
     BELOW_ONE_EACH,
     DIVIDES,
@@ -631,11 +632,12 @@ class Kfac:
         "its gradient, which is added to the task's.",
     )
     growth: float = key(
-        NOT_NEGATIVE,
+        AT_LEAST_MINUS_ONE,
         default=0.0,
         later=True,
         doc="Power by which the weight grows as the learning rate falls: it is multiplied by "
-        "(peak rate / rate) ** growth once the peak is reached.",
+        "(peak rate / rate) ** growth once the peak is reached. -1: it falls with the rate, as "
+        "AdamW's weight decay does.",
     )
 
 

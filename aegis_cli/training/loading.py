@@ -25,6 +25,7 @@ from aegis_cli.data.outliers import outliers
 from aegis_cli.data.relative import Places
 from aegis_cli.data.selection import Paths
 from aegis_cli.data.vqa import sets
+from aegis_cli.methods import kfac
 from aegis_cli.methods.base import Method
 from aegis_cli.models import backbones
 from aegis_cli.models.backbones import shapes
@@ -85,6 +86,8 @@ def load(
     recorded = _demonstrations(recipe, backbone, demos, on_event, ranks)
     _warn_of_no_instruction(demos, recorded, on_event)
     warn_of_outliers(demos, recorded, recipe.train, on_event)
+    if method.name == "kfac":
+        _warn_of_strong_pull(recipe, on_event)
     if anchor is not None and method.needs:
         _warn_of_another_prompt(anchor, recipe, on_event)
         _warn_of_other_cameras(anchor, demos, recorded.cameras, recipe.demos.rename, on_event)
@@ -348,6 +351,15 @@ def warn_of_outliers(
             "policy, and its errors look small. If they are recording faults and not rare motions, "
             "leave these episodes out (demos.only), or scale by quantiles (train.normalization)"
         )
+        on_event(Warned("train", text))
+
+
+def _warn_of_strong_pull(recipe: Recipe, on_event: OnEvent) -> None:
+    """Warn of a `kfac.weight` beside which the learning rate is so small that little is learned."""
+    if recipe.kfac.step != "proximal":
+        return
+    rate = recipe.train.backbone_lr
+    if text := kfac.why_strong(recipe.kfac.weight, rate, "--set kfac.weight"):
         on_event(Warned("train", text))
 
 

@@ -215,6 +215,19 @@ def test_a_truncated_vlm_is_protected_as_far_as_it_is_there(
     assert "not in the policy: layers.1." in caplog.text
 
 
+@pytest.mark.parametrize(("weight", "strong"), [(1.6, True), (1.4, False)])
+def test_a_pull_that_leaves_nothing_to_learn_at_the_rate_is_warned_of(
+    weight: float,
+    strong: bool,
+    tiny_folder: Path,
+    base: Backbone,
+    anchor: Path,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    make(Foreign(tiny_folder), "kfac", anchor, base, weight=weight)
+    assert ("--optimizer.weight=0.045" in caplog.text) == strong  # 15 times the rate of 3e-3
+
+
 def test_a_vlm_that_has_learned_before_is_refused_before_anything_moves(
     tiny_folder: Path, base: Backbone, anchor: Path
 ) -> None:

@@ -152,7 +152,7 @@ def drawn_back(toy: nn.Module, anchor: Anchor, update: Update, **options: Any) -
     return values(context.backbone)
 
 
-@pytest.mark.parametrize("growth", [0.0, 0.5, 2.0])
+@pytest.mark.parametrize("growth", [-1.0, 0.0, 0.5, 2.0])
 def test_the_weight_grows_as_the_learning_rate_falls(growth: float) -> None:
     context = make_setting()
     toy, anchor = context.backbone, context.anchor
@@ -165,10 +165,30 @@ def test_the_weight_grows_as_the_learning_rate_falls(growth: float) -> None:
         torch.testing.assert_close(tensor, heavy[name])
         assert torch.equal(early[name], plain[name])
     moved = not torch.allclose(late["first.weight"], plain["first.weight"])
-    assert moved == (growth > 0)
+    assert moved == (growth != 0)
 
 
-@pytest.mark.parametrize("growth", [1.0, 8.0, 80.0])
+@pytest.mark.parametrize("weight", [0.1, 0.5])
+def test_steps_of_one_size_settle_at_the_rate_over_weight_and_curvature(weight: float) -> None:
+    rate, context = 0.01, make_setting(weight=weight)
+    toy, origin = context.backbone, values(context.backbone)
+    parts, shape = kfac.METHOD.start(context), toy.second.weight
+    assert parts.constrain is not None and context.anchor is not None
+    found = curvatures(context.anchor, {"second": shape}, 0.1)["second"]
+    # One step moves each direction of the eigenbases by the rate.
+    step = rate * found.outputs.sum(1, keepdim=True) @ found.inputs.sum(1, keepdim=True).T
+    for _ in range(4000):
+        with torch.no_grad():
+            shape += step
+        parts.constrain(Update({}, {}, 1))
+    along = found.outputs.T @ (shape.detach() - origin["second.weight"]) @ found.inputs
+    curved = (found.g[:, None] + 0.1) * found.c[None, :]
+    stiff = curved > 0.05
+    assert stiff.any()
+    torch.testing.assert_close(along[stiff], (rate / (weight * curved))[stiff], rtol=0.01, atol=0)
+
+
+@pytest.mark.parametrize("growth", [-1.0, 1.0, 8.0, 80.0])
 @pytest.mark.parametrize("read", [True, False])
 def test_a_rate_of_zero_still_has_a_weight(growth: float, read: bool) -> None:
     context = make_setting()

@@ -537,6 +537,7 @@ def test_keys_that_do_not_go_together_are_refused(kind, setting, tmp_path):
     [
         ("train.final_lr_share=0", "train.final_lr_share: 0 with train.schedule: constant"),
         ("kfac.growth=1", "kfac.growth: 1 with train.schedule: constant"),
+        ("kfac.growth=-1", "kfac.growth: -1 with train.schedule: constant"),
     ],
 )
 def test_a_constant_schedule_takes_nothing_that_belongs_to_a_fall(setting, found, tmp_path):

@@ -98,6 +98,32 @@ def test_a_training_and_its_dry_run_warn_of_bf16_that_the_processor_has_nothing_
             assert any("train.precision=auto" in text for text in warned) is not has
 
 
+@pytest.mark.parametrize(
+    ("weight", "step", "method", "said_so"),
+    [
+        (0.6, "proximal", "kfac", True),
+        (0.4, "proximal", "kfac", False),
+        (0.6, "gradient", "kfac", False),
+        (0.6, "proximal", "naive", False),
+    ],
+)
+def test_a_training_and_its_dry_run_warn_of_a_pull_that_leaves_nothing_to_learn(
+    weight: float, step: str, method: str, said_so: bool, start: Start, recipe: Recipe,
+    demos_file: Path, anchor_file: Path, tmp_path: Path,
+) -> None:  # fmt: skip
+    chosen = replace(recipe, kfac=replace(recipe.kfac, weight=weight, step=step))
+    wanted = replace(chosen, train=replace(chosen.train, steps=1))
+    for stage in (dry_run, train):
+        said: list[Event] = []
+        given = (wanted, method, demos_file, anchor_file, tmp_path / stage.__name__)
+        stage.run(*given, on_event=said.append)
+        found = [e.text for e in said if isinstance(e, Warned) and "weight of kfac" in e.text]
+        assert bool(found) == said_so
+        # 600 times the rate of 1e-3, where 15 times would be 0.015.
+        words = ("600 times the backbone's learning rate 0.001", "--set kfac.weight=0.015")
+        assert all(word in text for text in found for word in words)
+
+
 @pytest.mark.parametrize("method", sorted(METHODS))
 def test_no_graph_outlives_its_step(method: str, start: Start, tmp_path: Path) -> None:
     made, kept = outputs_kept(lambda: start(method, tmp_path / "run"))
