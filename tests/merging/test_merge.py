@@ -518,7 +518,8 @@ def test_anchors_and_demonstrations_that_do_not_fit(
     for method, part in (("factors", "curvature"), ("inputs", "inputs")):
         given = (merge_place.run, "--method", method, "--anchor", moments, *write)
         bad(aegis, *given, says=(f"without {part}", f"--parts {part}"))
-    bad(aegis, merge_place.run, "--anchor", anchor_file, *write, says=("belongs to backbone",))
+    says = (f"not those of '{merge_place.base}'", "--base", "aegis anchor --backbone")
+    bad(aegis, merge_place.run, "--anchor", anchor_file, *write, says=says)
     bad(aegis, merge_place.run, "--demos", other, *write, says=("other demonstrations",))
     alone = tmp_path / "alone"
     shutil.copytree(merge_place.run, alone, symlinks=True)
