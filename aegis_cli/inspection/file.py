@@ -68,7 +68,6 @@ def _of_another_program(path: Path) -> InspectReport:
     types = Counter(tensor.dtype for tensor in tensors)
     facts: dict[str, Any] = {
         "written_by": "another program",
-        "tensors": len(tensors),
         "parameters": sum(math.prod(tensor.shape) for tensor in tensors),
         "types": {name: types[name] for name in sorted(types)},
     }

@@ -162,6 +162,12 @@ def _warn(pair: Pair, rows: _Rows, beside: Contents, on_event: OnEvent) -> None:
             "tensor for both: what the policy computes with it does not follow the VLM"
         )
         on_event(Warned("insert", text))
+    if (pair.vlm_at.parent / checkpoint.EXPERT).is_file():
+        text = (
+            "the VLM was trained together with another action expert, which is not put in: the "
+            "policy's own expert has not learned with it. Roll the new policy out before you use it"
+        )
+        on_event(Warned("insert", text))
     if others := pair.match.others:
         text = (
             f"the policy has another VLM of the same names, which stays as it was: under "

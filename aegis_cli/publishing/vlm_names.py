@@ -427,9 +427,12 @@ def _kept(
             "give the VLM that the policy was made from; of a policy with an adapter, "
             "merge that first",
         )
-    span = f"layers {first} to {max(layers)}" if first < max(layers) else f"layer {first}"
+    span, they = f"layer {first}", "it"
+    if first < max(layers):
+        span, they = f"layers {first} to {max(layers)}", "them"
+    lacks = f"the policy does not have {they}, so {they.replace('them', 'they')} never learned"
     kinds = (
-        (f"language {span}", "the policy does not have them, so they never learned", upper),
+        (f"language {span}", lacks, upper),
         ("behind the layers", "the policy does not have it, so it never learned", after),
         ("buffers", "they do not learn", buffers),
     )

@@ -325,6 +325,8 @@ def last(folder: Path) -> Path:
     path = Path(folder) / "checkpoints" / LAST
     if not (path / EXPERT).is_file():
         model_folder.refuse_foreign_policy(Path(folder))
+        if model_folder.is_model(Path(folder)):
+            raise _without_expert(folder)
         raise AegisError(
             f"no checkpoint in '{folder}'",
             "a run folder with checkpoints/last, the folder of one of its checkpoints, or a "
@@ -332,6 +334,20 @@ def last(folder: Path) -> Path:
             f"train one with aegis train … --out RUN{_not_asked(folder)}",
         )
     return path
+
+
+def _without_expert(folder: Path) -> AegisError:
+    """The error for a model by itself, such as one that `aegis extract` or `aegis merge` wrote."""
+    train = commands.aegis(
+        "train", "RECIPE", "--set", f"backbone={folder}", "--demos", "PATH", "--out", "RUN"
+    )
+    back = commands.aegis("insert", folder, "--into", "POLICY", "--out", "FOLDER")
+    return AegisError(
+        f"no checkpoint in '{folder}', a model by itself, without an action expert",
+        "a trained policy: a run's folder, or that of one of its checkpoints",
+        f"train one from it: {train}; a VLM that aegis extract took out of another program's "
+        f"policy goes back into that by {back}",
+    )
 
 
 def _not_asked(folder: Path) -> str:
