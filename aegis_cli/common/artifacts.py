@@ -187,8 +187,8 @@ def load(path: str | Path, kind: str | None = None, *, owner: Owner | None = Non
     _validate(path, header, tensors, again)
     if owner is not None and header.fingerprint != owner.fingerprint:
         raise AegisError(
-            f"{header.kind} '{path}' {_made_with(header, owner)}",
-            f"the {header.kind} of '{owner.name}' as it is now",
+            f"'{path}' ({header.kind}) {_made_with(header, owner)}",
+            f"one that was made with '{owner.name}' as it is now",
             owner.fix,
         )
     return Artifact(header, tensors)

@@ -305,7 +305,8 @@ def _without_state(run: Path) -> AegisError:
     merged = "as in a run that aegis merge wrote"
     on = "continue the run that was merged"
     if origin is not None:
-        merged, on = f"which was merged from '{origin}'", f"{on}: {commands.aegis('train', origin)}"
+        merged = f"which aegis merge made from '{origin}'"
+        on += f": {commands.aegis('train', origin)}"
     demos = [] if kept is None else [word for each in kept.demos for word in ("--demos", each)]
     learned = ["--set", f"backbone={run}", "--set", f"expert.start={run}"]
     again = commands.aegis("train", run / "recipe.yaml", *demos, *learned, "--out", "RUN")

@@ -420,7 +420,7 @@ def test_a_merged_run_is_refused_with_the_commands_that_go_on(
     moved = place.rename(tmp_path / "moved")
     monkeypatch.chdir(moved)
     origin = moved / "cut"
-    said = bad("train", "merged", says=(f"which was merged from '{origin}'",))
+    said = bad("train", "merged", says=(f"which aegis merge made from '{origin}'",))
     own, anew = re.findall(r"aegis (train [/m].+?)(?:; |$)", " ".join(said.split()))
     assert own == f"train {origin}"
     learned = "--set backbone=merged --set expert.start=merged --out RUN"

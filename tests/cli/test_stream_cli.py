@@ -222,7 +222,7 @@ def test_damaged_experts_are_refused(aegis: Aegis, place: Path, bad: Callable[..
         bad("probe", "run", says=("NaN", first))
         path.write_bytes(kept)
         forge(path, lambda header: header.update(fingerprint="0" * 64))
-        says = (f"run/{name}.safetensors", "not those of 'embedded-dual'", "bring", "train")
+        says = (f"run/{name}.safetensors", "not those of 'tiny'", "bring", "train")
         bad("probe", "run", says=says)
         path.write_bytes(kept)
 

@@ -595,6 +595,9 @@ def test_a_merged_run_is_not_trained_on(
     given = ("--demos", merge_place.demos, "--out", out, "--resume")
     err = refused(aegis("train", out / "recipe.yaml", *given))
     assert "aegis merge" in err
-    # Its folder does not say what it was trained on, and that would not help.
+    # It is not asked for what it was trained on, but a new run is, whose command names that.
     err = refused(aegis("train", out))
-    assert "aegis merge" in err and "--set 'expert.start=" in err and "--demos" not in err
+    assert f"aegis merge made from '{merge_place.run}'" in err
+    assert "does not record" not in err and f"aegis train {merge_place.run};" in err
+    again = f"aegis train {out}/recipe.yaml --demos {merge_place.demos} --set backbone={out}"
+    assert f"{again} --set expert.start={out} --out RUN" in err
