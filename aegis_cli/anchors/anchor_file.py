@@ -8,7 +8,9 @@ rounding turns a direction by about 2e-4, so it lets through 4e-8 of its energy.
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Collection, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +18,7 @@ import torch
 from torch import Tensor
 
 from aegis_cli.anchors.second_moments import shared
-from aegis_cli.common import artifacts
+from aegis_cli.common import artifacts, commands
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.moments import Moments
 from aegis_cli.core.spectrum import Spectrum, orthonormal, with_rest
@@ -103,13 +105,60 @@ def _spectrum_tensors(site: str, spectrum: Spectrum, dtype: torch.dtype) -> dict
     return found
 
 
-def load(path: Path, fingerprint: str) -> Anchor:
-    """Read the anchor of the backbone with this fingerprint.
+@dataclass(frozen=True)
+class Wanted:
+    """The backbone that an anchor has to belong to.
+
+    Attributes:
+        fingerprint: sha256 of its weights.
+        name: what it was loaded from, as the user knows it.
+        option: how the command takes another one, as the beginning of words, such as `--base `.
+        measuring: the command that measures its anchor; None: with the settings of the anchor that
+            was given; empty: its own anchor is of no use here.
+    """
+
+    fingerprint: str
+    name: str
+    option: str
+    measuring: str | None = None
+
+
+def load(path: Path, wanted: Wanted) -> Anchor:
+    """Read the anchor of a backbone.
 
     Raises:
         AegisError: no anchor, a damaged one, or that of another backbone.
     """
-    return from_artifact(artifacts.load(path, "anchor", fingerprint=fingerprint))
+    return from_artifact(artifacts.load(path, "anchor", owner=_owner(path, wanted)))
+
+
+def _owner(path: Path, wanted: Wanted) -> artifacts.Owner:
+    header = artifacts.read_header(path, "anchor")
+    there = artifacts.made_with(header)
+    fix = f"bring back the weights that '{there}' had then"
+    if there != wanted.name:
+        other = "MODEL" if there is None else shlex.quote(there)
+        fix = f"give the backbone that the anchor was measured on: {wanted.option}{other}"
+    measuring = _measuring(header, wanted.name) if wanted.measuring is None else wanted.measuring
+    if measuring:
+        fix += f"; or measure the anchor of '{wanted.name}': {measuring}"
+    return artifacts.Owner(wanted.fingerprint, wanted.name, fix)
+
+
+def _measuring(header: artifacts.Header, backbone: str) -> str:
+    """The command that measures a backbone's anchor on the data of another anchor."""
+    meta = header.meta
+    words = ["anchor", "--backbone", backbone]
+    words += [f"--{name}={meta[name]}" for name in ("vqa", "ask", "demos") if name in meta]
+    if isinstance(parts := meta.get("parts"), list):
+        words += ["--parts", ",".join(map(str, parts))]
+    return commands.aegis(*words, "--out", "FILE")
+
+
+def measured_on(header: artifacts.Header) -> str:
+    """A remark on the backbone that an anchor was measured on; empty if it is not recorded."""
+    name = artifacts.made_with(header)
+    return "" if name is None else f" (it was measured on '{name}')"
 
 
 def from_artifact(artifact: artifacts.Artifact) -> Anchor:

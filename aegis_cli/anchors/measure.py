@@ -118,7 +118,7 @@ def run(
                 on_event,
             )
         _warn_of_few(measured.samples, settings, on_event)
-        report = ranks.by_first(lambda: _written(measured, settings, Path(out)))
+        report = ranks.by_first(lambda: _written(measured, backbone, settings, Path(out)))
         measured.work.remove()
         return report
 
@@ -161,8 +161,8 @@ def _warn_of_few(samples: int, settings: Settings, on_event: OnEvent) -> None:
     on_event(Warned("anchor", text))
 
 
-def _written(measured: _Measured, settings: Settings, out: Path) -> AnchorReport:
-    """Write the anchor."""
+def _written(measured: _Measured, backbone: str, settings: Settings, out: Path) -> AnchorReport:
+    """Write the anchor of the backbone of this name."""
     anchor = measured.anchor
     anchor_file.save(
         out,
@@ -171,6 +171,7 @@ def _written(measured: _Measured, settings: Settings, out: Path) -> AnchorReport
         inputs=measured.inputs,
         fingerprint=measured.fingerprint,
         meta={
+            artifacts.BACKBONE: backbone,
             **measured.meta,
             "samples": measured.samples,
             "parts": sorted(set(settings.parts)),

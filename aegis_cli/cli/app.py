@@ -59,6 +59,7 @@ from aegis_cli.cli.options import (
     Set,
     SkipBad,
     StoredIn,
+    VlmPrefix,
     Vqa,
     Wide,
     above_zero,
@@ -1294,6 +1295,7 @@ def extract(
         Dtype,
         Option("--dtype", help="Type of the weights: what --base is stored in, or another."),
     ] = Dtype.source,
+    prefix: VlmPrefix = None,
     as_json: Json = False,
 ) -> None:
     """Take the VLM out of a robot policy that another program trained, as a Hugging Face model.
@@ -1307,7 +1309,7 @@ def extract(
     \b
     Example: aegis extract pretrained_model --base google/paligemma-3b-pt-224 --out vlm
     """
-    stages.EXTRACT.run(policy, base, out, dtype.value, as_json=as_json)
+    stages.EXTRACT.run(policy, base, out, dtype.value, prefix=prefix, as_json=as_json)
 
 
 @app.command(short_help="Put a VLM back into a policy trained elsewhere.")
@@ -1327,6 +1329,7 @@ def insert(
         ),
     ],
     out: Annotated[Path, Option(metavar="FOLDER", help="New folder to write.")],
+    prefix: VlmPrefix = None,
     as_json: Json = False,
 ) -> None:
     """Put a VLM back into a robot policy that another program trained, as a new folder.
@@ -1339,7 +1342,7 @@ def insert(
     \b
     Example: aegis insert merged --into pretrained_model --out policy
     """
-    stages.INSERT.run(vlm, into, out, as_json=as_json)
+    stages.INSERT.run(vlm, into, out, prefix=prefix, as_json=as_json)
 
 
 @app.command(short_help="Train the embedded models from scratch.")

@@ -39,7 +39,7 @@ _KEEPS = {  # what other commands do not measure again, if the cache can be writ
     "evaluate": "predictions so far are kept",
     "merge": "the strengths so far are kept",
     "probe": "answers so far are kept",
-    "rollout": "groups of episodes are kept that were played to their end (of 64, or LIBERO's 10)",
+    "rollout": "episodes so far are kept",
 }
 # pydantic's names for a value of the wrong type -> the words for the user.
 _NO_NUMBER = {

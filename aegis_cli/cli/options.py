@@ -261,6 +261,14 @@ StoredIn = Annotated[
         "trained, or another.",
     ),
 ]
+VlmPrefix = Annotated[
+    str | None,
+    Option(
+        metavar="NAME",
+        help="Of a policy with several VLMs, such as one beside its average (EMA): the beginning "
+        "of the names of the one to take.",
+    ),
+]
 Json = Annotated[bool, Option("--json", help="Print the report as JSON on stdout.")]
 Wide = Annotated[
     bool,

@@ -59,7 +59,25 @@ def _instead(folder: Path) -> str:
             f"give one of its runs, e.g. {commands.aegis('train', inner[0])}; to "
             "resume a job or study of aegis run, run its command again"
         )
+    if instead := _from_model(folder):
+        return instead
     return "check the path, or begin a run: aegis train RECIPE --out RUN"
+
+
+def _from_model(folder: Path) -> str:
+    """How to train from a model or a policy that was given instead of a recipe; may be empty."""
+    from aegis_cli.models.backbones import model_folder
+
+    if model_folder.foreign_policy(folder) is not None:
+        return model_folder.take_out(folder)
+    is_policy = model_folder.is_policy(folder) or (folder / "expert.safetensors").is_file()
+    if not is_policy and not model_folder.is_model(folder) and not model_folder.weights(folder):
+        return ""
+    words = ["--set", f"backbone={folder}"]
+    if is_policy:
+        words += ["--set", f"expert.start={folder}"]
+    command = commands.aegis("train", "RECIPE", *words, "--demos", "PATH", "--out", "RUN")
+    return f"name it in a recipe: {command}"
 
 
 def inputs_of(

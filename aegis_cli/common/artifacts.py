@@ -55,13 +55,16 @@ class Artifact:
 
 __all__ = [
     "KINDS",
+    "BACKBONE",
     "MIGRATIONS",
     "Artifact",
     "Header",
+    "Owner",
     "TensorSpec",
     "is_artifact",
     "load",
     "load_json",
+    "made_with",
     "read_header",
     "save",
     "save_json",
@@ -81,6 +84,7 @@ _FORMAT = {
     torch.int8: "I8",
     torch.uint8: "U8",
 }
+BACKBONE = "backbone"  # in the meta of a file: the backbone that it was made with, as it was given
 _NO_DIGEST = "0" * 64  # placeholder for a file's digest
 
 
@@ -132,12 +136,27 @@ def save(
     return replace(header, digest=hashed.result())
 
 
-def load(path: str | Path, kind: str | None = None, *, fingerprint: str | None = None) -> Artifact:
+@dataclass(frozen=True)
+class Owner:
+    """The backbone that a file has to belong to.
+
+    Attributes:
+        fingerprint: digest of its weights.
+        name: what it was loaded from, as the user knows it.
+        fix: what to do about a file that belongs to another one.
+    """
+
+    fingerprint: str
+    name: str
+    fix: str
+
+
+def load(path: str | Path, kind: str | None = None, *, owner: Owner | None = None) -> Artifact:
     """Read and validate one artifact; its tensors stay memory-mapped.
 
     It checks, in this order: the kind, the schema (older ones are migrated), the exact tensors with
     shapes and dtypes, the digest if the file has one, that values are finite and in the kind's
-    domain, and the backbone's fingerprint if one is given.
+    domain, and whether it belongs to the backbone, if one is given.
 
     Raises:
         AegisError: the first check that fails.
@@ -166,14 +185,29 @@ def load(path: str | Path, kind: str | None = None, *, fingerprint: str | None =
         )
     header, tensors = _migrate(header, tensors)
     _validate(path, header, tensors, again)
-    if fingerprint is not None and header.fingerprint != fingerprint:
+    if owner is not None and header.fingerprint != owner.fingerprint:
         raise AegisError(
-            f"{header.kind} '{path}' belongs to backbone {_short(header.fingerprint)}",
-            f"one that belongs to backbone {_short(fingerprint)}",
-            f"run '{KINDS[header.kind].command}' again with this backbone, or use the backbone "
-            "the file was made with",
+            f"'{path}' ({header.kind}) {_made_with(header, owner)}",
+            f"one that was made with '{owner.name}' as it is now",
+            owner.fix,
         )
     return Artifact(header, tensors)
+
+
+def made_with(header: Header) -> str | None:
+    """The name of the backbone that a file was made with, as it was given; None if not recorded."""
+    said = header.meta.get(BACKBONE)
+    return said if isinstance(said, str) else None
+
+
+def _made_with(header: Header, owner: Owner) -> str:
+    """Which backbone a file of another one was made with, in words."""
+    there, here = _short(header.fingerprint), _short(owner.fingerprint)
+    name = made_with(header)
+    if name == owner.name:
+        return f"was made with '{name}' when that had other weights (digest {there}, now {here})"
+    what = "weights that" if name is None else f"'{name}', whose weights"
+    return f"was made with {what} are not those of '{owner.name}' (digest {there}, not {here})"
 
 
 def _migrate(header: Header, tensors: dict[str, Tensor]) -> tuple[Header, dict[str, Tensor]]:
@@ -298,7 +332,7 @@ def _matcher(pattern: str) -> Callable[[str], object]:
 
 
 def _short(fingerprint: str | None) -> str:
-    return "unknown (no fingerprint)" if fingerprint is None else f"'{fingerprint[:12]}'"
+    return "unknown" if fingerprint is None else fingerprint[:12]
 
 
 def _check_inputs(kind: str) -> str:

@@ -76,14 +76,22 @@ def read(path: Path) -> StreamReport:
         ) from error
 
 
+def bring_back(model: str) -> str:
+    """What to do about files of a stream that belong to other weights of its model."""
+    return f"bring '{model}' back as it was when the stream was trained, or train the stream again"
+
+
 def attach(run: AnyStreamRun) -> None:
     """Put a finished run's experts, routers and Gaussians back beside the bare model.
 
     Raises:
         AegisError: files are missing, damaged, or belong to another encoder.
     """
-    experts = artifacts.load(run.out / EXPERTS, "experts", fingerprint=run.fingerprint)
-    routers = artifacts.load(run.out / ROUTING, "routing", fingerprint=run.fingerprint)
+    recipe = run.recipe
+    name = recipe.encoder if isinstance(recipe, recipes.StreamRecipe) else recipe.backbone
+    owner = artifacts.Owner(run.fingerprint, name, bring_back(name))
+    experts = artifacts.load(run.out / EXPERTS, "experts", owner=owner)
+    routers = artifacts.load(run.out / ROUTING, "routing", owner=owner)
     if routers.header.meta.get("experts") != digest(experts.tensors):
         raise AegisError(
             f"'{run.out / EXPERTS}' and '{run.out / ROUTING}' do not belong together",

@@ -405,7 +405,8 @@ def load_to_act(path: Path) -> RobotStreamRun:
     trains_model = learners.get(recipe.train.method).trains == "model"
     backbone = backbones.load(str(path / BACKBONE) if trains_model else recipe.backbone)
     backbone = backbone.to(devices.pick())
-    saved = _saved_expert(path / ACTION_EXPERT, recipe, backbone.fingerprint())
+    home = path / BACKBONE if trains_model else None
+    saved = _saved_expert(path / ACTION_EXPERT, recipe, backbone.fingerprint(), home)
     shape = _checked_shape(path / ACTION_EXPERT, saved, backbone, len(recipe.tasks))
     scales = [
         (_scale(saved.tensors, i, "proprio"), _scale(saved.tensors, i, "action"))
@@ -422,13 +423,20 @@ def load_to_act(path: Path) -> RobotStreamRun:
     return run
 
 
-def _saved_expert(path: Path, recipe: RobotStreamRecipe, fingerprint: str) -> artifacts.Artifact:
+def _saved_expert(
+    path: Path, recipe: RobotStreamRecipe, fingerprint: str, home: Path | None
+) -> artifacts.Artifact:
     """The action expert of a run, with each task's scales.
+
+    Args:
+        home: the folder of the run's own backbone; None: it is the recipe's.
 
     Raises:
         AegisError: the file is missing, damaged, or belongs to other tasks or another backbone.
     """
-    saved = artifacts.load(path, "expert", fingerprint=fingerprint)
+    name = recipe.backbone if home is None else str(home)
+    owner = artifacts.Owner(fingerprint, name, files.bring_back(name))
+    saved = artifacts.load(path, "expert", owner=owner)
     if saved.header.meta.get("tasks") != list(recipe.tasks):
         raise AegisError(
             f"'{path}' is not the action expert of {', '.join(recipe.tasks)}",

@@ -139,7 +139,7 @@ def run(
     before = None if reference_model is None else reference_model.model
     if before is not None:
         _warn_of_another_start(target, baseline, before, on_event)
-    measured = None if anchor is None else _anchor(anchor, model, before)
+    measured = None if anchor is None else _anchor(anchor, target, model, baseline, before)
     # Both models have to read every question, since the drop compares the same questions.
     checks = [m.check_text for m in (model, before) if m is not None]
     asked = source.choose("probe", questions, seed, checks, on_event)
@@ -304,7 +304,7 @@ def answers(
     target: str,
     asked: VQASet,
     batch_size: int,
-    anchor: tuple[Path, str] | None = None,
+    anchor: tuple[Path, anchor_file.Wanted] | None = None,
     on_event: OnEvent = ignore,
 ) -> Answers:
     """Ask a run or backbone, and measure its drift from an anchor.
@@ -312,7 +312,7 @@ def answers(
     If torchrun has started several processes, each calls this, and they share the questions.
 
     Args:
-        anchor: its file, and the fingerprint of the backbone that it must belong to.
+        anchor: its file, and the backbone that it must belong to.
 
     Raises:
         AegisError: nothing to load, or an anchor of another backbone.
@@ -326,19 +326,19 @@ def answers(
     return Answers(graded, layers, model.image_size)
 
 
-def _anchor(path: Path, model: Backbone, before: Backbone | None) -> Anchor:
+def _anchor(
+    path: Path, target: str, model: Backbone, baseline: str | None, before: Backbone | None
+) -> Anchor:
     """The anchor, which must be that of the pre-trained backbone.
 
     An anchor measured on a trained backbone would hide the drift.
     """
-    owner = (model if before is None else before).fingerprint()
-    try:
-        measured = anchor_file.load(path, owner)
-    except AegisError as error:
-        if before is not None or artifacts.read_header(path).fingerprint == owner:
-            raise
-        fix = "add --baseline embedded, or whichever backbone the anchor was measured on"
-        raise AegisError(error.found, error.expected, fix) from error
+    if baseline is None or before is None:
+        # Its own anchor is no help: the drift from that is none.
+        wanted = anchor_file.Wanted(model.fingerprint(), target, "--baseline ", "")
+    else:
+        wanted = anchor_file.Wanted(before.fingerprint(), baseline, "--baseline ")
+    measured = anchor_file.load(path, wanted)
     if not measured.image:
         fix = "measure it: aegis anchor --parts moments"
         raise AegisError("an anchor without moments", "one to measure the drift from", fix)

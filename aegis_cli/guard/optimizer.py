@@ -85,7 +85,8 @@ class ProtectedAdamW(torch.optim.AdamW):
         self._anchor, header = load_anchor(method, Path(anchor))
         if header.fingerprint != base.fingerprint():
             raise AegisError(
-                f"anchor '{anchor}', which was not measured on the base model's weights",
+                f"anchor '{anchor}', which was not measured on the base model's weights"
+                f"{anchor_file.measured_on(header)}",
                 "the VLM that the anchor was measured on",
                 "name it as the base, as in aegis anchor --backbone",
             )

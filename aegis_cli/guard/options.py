@@ -240,13 +240,15 @@ def _names(model: nn.Module, header: artifacts.Header, path: Path) -> PlainNames
     expected, fix = "the pre-trained weights", "measure again with Guard.measure"
     if wrappers.adapted(model):
         raise AegisError(
-            f"the weights and adapters are not those that anchor '{path}' was measured on",
+            f"the weights and adapters are not those that anchor '{path}' was measured on"
+            f"{anchor_file.measured_on(header)}",
             f"{expected}, and adapters that change nothing yet, as a fresh LoRA",
             "make the guard before trained adapters are loaded, and let them begin at zero "
             f"(neither pissa nor olora); or {fix}, with the adapters in place",
         )
     raise AegisError(
-        f"the weights are not those that anchor '{path}' was measured on",
+        f"the weights are not those that anchor '{path}' was measured on"
+        f"{anchor_file.measured_on(header)}",
         f"{expected}, loaded in the type that they are stored in",
         f"make the guard before fine-tuned weights are loaded into the model, or {fix}",
     )

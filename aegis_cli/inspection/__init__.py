@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from aegis_cli.common import hub
+from aegis_cli.common import commands, hub
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, ignore
 from aegis_cli.inspection import file
@@ -121,6 +121,12 @@ def verify(path: Path) -> dict[Path, bool]:
     from aegis_cli.common import artifacts
 
     path = _located(path)
+    if path.suffix == ".safetensors" and path.is_file() and not artifacts.is_artifact(path):
+        raise AegisError(
+            f"'{path}', which another program wrote, without a digest",
+            "a file or folder that Aegis wrote",
+            f"leave out --verify: {commands.aegis('inspect', path)}",
+        )
     if not path.is_dir():
         return {path: artifacts.load(path).header.digest is not None}
     # A file reached through several links, such as the last checkpoint's, counts once.

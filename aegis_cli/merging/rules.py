@@ -70,7 +70,8 @@ def _given(path: Path, source: Source, settings: MergeSettings, part: str) -> An
     Raises:
         AegisError: no anchor, an anchor of another model, or one without the part.
     """
-    found = anchor_file.load(path, source.base.fingerprint())
+    wanted = anchor_file.Wanted(source.base.fingerprint(), source.base_name, "--base ")
+    found = anchor_file.load(path, wanted)
     if not getattr(found, part):
         raise AegisError(
             f"an anchor without {part} for method '{settings.method}'",

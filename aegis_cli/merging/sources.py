@@ -173,7 +173,7 @@ class PolicyRun:
             if name != machine.NAME or (self._run / name).is_file():
                 shutil.copyfile(self._run / name, folder / name)
         if (kept := places.of(self._run)) is not None:
-            places.keep(folder, kept, out, places.began_in(self._run))
+            places.keep(folder, kept, out, places.began_in(self._run), self._run)
         # For a checkpoint before the last one, later steps do not count.
         run_folder.truncate_metrics(folder, step)
         saved = artifacts.load(self._run / "ledger.safetensors", "ledger")

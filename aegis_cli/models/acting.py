@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import itertools
 import math
 import time
@@ -15,7 +16,7 @@ import numpy as np
 import torch
 
 from aegis_cli import sim
-from aegis_cli.common import media
+from aegis_cli.common import kept_lines, media
 from aegis_cli.common.estimates import estimate
 from aegis_cli.common.events import OnEvent, Progress, ignore
 from aegis_cli.common.kept_lines import KeptLines
@@ -204,7 +205,8 @@ def play(
     """
     task, pace = acting.task, _Pace(acting.replan, delay, guided)
     started = time.perf_counter()
-    before, before_s = {} if kept is None else _kept(kept), 0.0
+    before, begun = ({}, {}) if kept is None else _kept(kept)
+    before_s = 0.0
     finished: list[_Played] = []
     films: list[media.Clip] = []
     stage = f"rollout {colors}" if sim.has_colors(task) else "rollout"
@@ -220,15 +222,23 @@ def play(
                 longest = known.episodes[0].longest
                 on_event(Progress(stage, numbers.stop * longest, episodes * longest, "steps"))
                 continue
-            began = time.perf_counter()
-            # The first episodes are filmed.
-            group = _begun(acting, simulators, seed, stream, numbers, colors, clips, on_event)
-            longest = group[0].env.spec.max_steps
-            for _ in _play(acting, simulators, group, pace, first, seed):
-                # An episode that ended early counts in full, so that the progress reaches 100 %.
-                in_group = sum(longest if e.done else e.steps for e in group)
-                done = first * longest + in_group
-                on_event(Progress(stage, done, episodes * longest, "steps"))
+            part = begun.get((first, len(numbers)), _Begun([], 0.0))
+            began, known_steps = time.perf_counter() - part.seconds, len(part.decided)
+            before_s += part.seconds
+            try:
+                # The first episodes are filmed.
+                group = _begun(acting, simulators, seed, stream, numbers, colors, clips, on_event)
+                longest = group[0].env.spec.max_steps
+                for _ in _play(acting, simulators, group, pace, first, seed, part.decided):
+                    # An episode that ended early counts in full, so the progress reaches 100 %.
+                    in_group = sum(longest if e.done else e.steps for e in group)
+                    done = first * longest + in_group
+                    on_event(Progress(stage, done, episodes * longest, "steps"))
+            except BaseException:  # a signal, above all
+                if kept is not None and len(part.decided) > known_steps:
+                    seconds = time.perf_counter() - began
+                    kept.add([_line_begun(numbers, _Begun(part.decided, seconds))])
+                raise
             films += [_clip(episode) for episode in group[: max(0, clips - first)]]
             played = [_played(episode) for episode in group]
             if kept is not None:
@@ -275,16 +285,55 @@ def _line(first: int, group: _Group) -> dict[str, Any]:
     return {"first": first, "seconds": group.seconds, "episodes": episodes}
 
 
-def _kept(kept: KeptLines) -> dict[tuple[int, int], _Group]:
-    """The stored groups, by their first episode and the number of episodes."""
-    found = {}
+class _Begun(NamedTuple):
+    """The beginning of a group that was interrupted.
+
+    Attributes:
+        decided: the chunks [B, H, A] of its unfinished episodes at each prediction so far. With
+            them its episodes are played again without the policy, up to where it was interrupted.
+        seconds: how long that took.
+    """
+
+    decided: list[np.ndarray]
+    seconds: float
+
+
+def _line_begun(numbers: Sequence[int], begun: _Begun) -> dict[str, Any]:
+    """The beginning of a group as a stored line."""
+    decided = []
+    for chunk in begun.decided:
+        raw = base64.b64encode(np.ascontiguousarray(chunk).tobytes()).decode()
+        decided.append({"type": chunk.dtype.str, "shape": chunk.shape, "bytes": raw})
+    line = {"first": numbers[0], "count": len(numbers), "seconds": begun.seconds}
+    return kept_lines.sealed(line | {"decided": decided})
+
+
+def _read_begun(line: Mapping[str, Any]) -> _Begun:
+    decided = []
+    for chunk in line["decided"]:
+        flat = np.frombuffer(base64.b64decode(chunk["bytes"]), np.dtype(chunk["type"]))
+        # A copy, since torch warns of memory that cannot be written.
+        decided.append(flat.reshape(chunk["shape"]).copy())
+    return _Begun(decided, float(line["seconds"]))
+
+
+Key = tuple[int, int]  # a group's first episode, and how many episodes it has
+
+
+def _kept(kept: KeptLines) -> tuple[dict[Key, _Group], dict[Key, _Begun]]:
+    """The stored groups that were finished, and the beginnings of others."""
+    found, begun = dict[Key, _Group](), dict[Key, _Begun]()
     for line in kept.read():
         try:
+            if "decided" in line:
+                if (said := kept_lines.unsealed(line)) is not None:
+                    begun[said["first"], said["count"]] = _read_begun(said)
+                continue
             episodes = [_Played(**episode) for episode in line["episodes"]]
             found[line["first"], len(episodes)] = _Group(episodes, float(line["seconds"]))
         except (KeyError, TypeError, ValueError):  # an unreadable line: that group is played again
             continue
-    return found
+    return found, begun
 
 
 def _simulators(acting: Acting, episodes: int) -> AbstractContextManager[Simulators]:
@@ -310,7 +359,7 @@ def longest_s(acting: Acting, episodes: int, colors: str, stream: int, seed: int
         group = _begun(acting, simulators, seed, stream, numbers, colors, filmed=0)
         before, taken, seconds, started = 0, 0, 0.0, time.perf_counter()
         begun_s = (started - placing) * math.ceil(episodes / len(group))
-        playing = _play(acting, simulators, group, _Pace(acting.replan), 0, seed)
+        playing = _play(acting, simulators, group, _Pace(acting.replan), 0, seed, [])
         for _ in itertools.islice(playing, 2):
             now, steps = time.perf_counter(), sum(e.steps for e in group)
             seconds, taken = now - started, steps - before
@@ -436,17 +485,30 @@ def _play(
     pace: _Pace,
     first: int,
     seed: int,
+    decided: list[np.ndarray],
 ) -> Iterator[None]:
-    """Run a group to its end in lockstep, chunk by chunk; finished episodes drop out."""
+    """Run a group to its end in lockstep, chunk by chunk; finished episodes drop out.
+
+    Args:
+        decided: the chunks that are already known of an earlier, interrupted run of this group, in
+            order; all further ones are added.
+    """
     # Seeded by the group, so that the noise does not depend on how earlier groups ended.
     generator = torch.Generator().manual_seed(seed * 1_000_003 + first)
-    while active := [e for e in group if not e.done]:
-        continued = _continued(active, pace)
-        seen = [e.observation for e in active]
-        chunks = _decide(acting, seen, generator, continued)  # [B, H, A]
+    for number in itertools.count():
+        if not (active := [e for e in group if not e.done]):
+            return
+        if number < len(decided):
+            # The policy would have drawn this noise.
+            acting.policy.draw_noise(len(active), generator)
+        else:
+            seen = [e.observation for e in active]
+            decided.append(_decide(acting, seen, generator, _continued(active, pace)))
+        # Only what the policy looks at is rendered.
+        looks = number + 1 >= len(decided)
         simulators.each(
-            lambda decided: _execute(decided[0], _to_execute(*decided, pace)),
-            list(zip(active, chunks, strict=True)),
+            lambda each, looks=looks: _execute(each[0], _to_execute(*each, pace), looks),
+            list(zip(active, decided[number], strict=True)),
         )
         yield
 
@@ -499,14 +561,15 @@ def _fitted(pictures: Sequence[np.ndarray], sizes: Sizes) -> Sequence[np.ndarray
     return [fit(picture, *size) for picture, size in zip(pictures, sizes, strict=True)]
 
 
-def _execute(episode: _PlayedEpisode, actions: np.ndarray) -> None:
+def _execute(episode: _PlayedEpisode, actions: np.ndarray, looks: bool = True) -> None:
     """Execute a chunk of actions.
 
-    An observation is rendered after the last action; for a film, after each.
+    An observation is rendered after the last action, if the policy looks at it; for a film, after
+    each.
     """
     every = max(1, round(episode.env.spec.control_hz / media.FRAMES_PER_S))
     for number, action in enumerate(actions, 1):
-        look = number == len(actions) or episode.moments is not None
+        look = (looks and number == len(actions)) or episode.moments is not None
         # Actions are defined in [-1, 1]; a flow may end slightly outside.
         given = np.clip(action, -1, 1)
         if episode.executed is not None:

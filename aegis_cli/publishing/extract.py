@@ -32,7 +32,7 @@ from aegis_cli.models.backbones import model_folder
 from aegis_cli.publishing import foreign_policy, tensor_files
 from aegis_cli.publishing.foreign_policy import Pair
 from aegis_cli.publishing.tensor_files import NAMES, TYPES
-from aegis_cli.publishing.vlm_names import Spec
+from aegis_cli.publishing.vlm_names import Asked, Spec
 from aegis_cli.training import checkpoint
 from aegis_cli.training.card import without_folders
 
@@ -94,7 +94,12 @@ class ExtractReport:
 
 
 def run(
-    policy: str, base: str, out: Path, dtype: str = SOURCE, on_event: OnEvent = ignore
+    policy: str,
+    base: str,
+    out: Path,
+    dtype: str = SOURCE,
+    on_event: OnEvent = ignore,
+    prefix: str | None = None,
 ) -> ExtractReport:
     """Write the VLM of a policy as a folder that can be used wherever a backbone can.
 
@@ -103,13 +108,16 @@ def run(
         base: the VLM that the policy was made from.
         out: a new folder; if this fails, nothing of it is left.
         dtype: dtype of the weights, SOURCE or one of `STORED_TYPES`.
+        prefix: which VLM to take of a policy that has several, by the beginning of its names.
 
     Raises:
         AegisError: a policy of Aegis, or no policy; a base that is not a VLM, or not the policy's;
-            or a folder that already exists.
+            a policy with several VLMs and no prefix; or a folder that already exists.
     """
     check_new(out)
-    with foreign_policy.opened(policy, base) as pair:
+    again = ("extract", policy, "--base", base, "--out", str(out))
+    again += () if dtype == SOURCE else ("--dtype", dtype)
+    with foreign_policy.opened(Asked(policy, base, prefix, again)) as pair:
         types = _types(pair, dtype)
         counted = _Counted(pair, types, (policy, base))
         make_folder(out.parent)

@@ -14,7 +14,7 @@ from aegis_cli.models import backbones
 from aegis_cli.models.backbones import model_folder
 from aegis_cli.publishing import policy_copy, tensor_files, vlm_names
 from aegis_cli.publishing.tensor_files import Tensors
-from aegis_cli.publishing.vlm_names import Match
+from aegis_cli.publishing.vlm_names import Asked, Match
 from aegis_cli.training import checkpoint
 
 _EXPECTED = "a policy's weights as safetensors: LeRobot's pretrained_model folder, or openpi's"
@@ -41,17 +41,18 @@ class Pair:
 
 
 @contextlib.contextmanager
-def opened(policy: str, vlm: str) -> Generator[Pair]:
+def opened(asked: Asked) -> Generator[Pair]:
     """Open both, and find the VLM's tensors in the policy's.
 
     Args:
-        policy: a folder, a file or a hub id.
-        vlm: a Hugging Face model, as `backbones.load` takes it.
+        asked: the policy, as a folder, a file or a hub id, and the VLM, as `backbones.load` takes
+            it.
 
     Raises:
         AegisError: either is missing, damaged or something else, or the policy was made from
-            another VLM.
+            another VLM, or has several of them.
     """
+    policy, vlm = asked.policy, asked.vlm
     at, (folder, layers) = locate(policy), _vlm(vlm)
     with (
         tensor_files.opened(_weights(at, policy)) as own,
@@ -68,7 +69,7 @@ def opened(policy: str, vlm: str) -> Generator[Pair]:
             )
         tables = vlm_names.pair_of_tables(other.specs)
         tied = tables is None or tensor_files.equal(other, *tables)
-        found = vlm_names.match(other.specs, own.specs, tied, (policy, vlm))
+        found = vlm_names.match(other.specs, own.specs, tied, asked)
         yield Pair(own, at, other, folder, layers, found)
 
 

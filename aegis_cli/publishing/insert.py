@@ -25,6 +25,7 @@ from aegis_cli.publishing.extract import (
 from aegis_cli.publishing.foreign_policy import Pair
 from aegis_cli.publishing.policy_copy import Contents
 from aegis_cli.publishing.tensor_files import TYPES
+from aegis_cli.publishing.vlm_names import Asked
 from aegis_cli.training import checkpoint
 
 
@@ -56,7 +57,9 @@ class InsertReport:
         return asdict(self)
 
 
-def run(vlm: str, policy: str, out: Path, on_event: OnEvent = ignore) -> InsertReport:
+def run(
+    vlm: str, policy: str, out: Path, on_event: OnEvent = ignore, prefix: str | None = None
+) -> InsertReport:
     """Write a copy of a policy's folder, with the tensors of a VLM in place of its own VLM's.
 
     They are written with the policy's dtypes and names. Unless extraction lost precision, inserting
@@ -66,13 +69,15 @@ def run(vlm: str, policy: str, out: Path, on_event: OnEvent = ignore) -> InsertR
         vlm: a Hugging Face model, such as an extracted one after `aegis merge`.
         policy: a folder or a hub id.
         out: a new folder; if this fails, nothing of it is left.
+        prefix: as for `extract.run`; the policy's other VLMs stay as they are.
 
     Raises:
         AegisError: as `aegis extract` does, or a policy that is a file, or whose folder cannot be
             copied.
     """
     check_new(out)
-    with foreign_policy.opened(policy, vlm) as pair:
+    again = ("insert", vlm, "--into", policy, "--out", str(out))
+    with foreign_policy.opened(Asked(policy, vlm, prefix, again)) as pair:
         if not pair.policy_at.is_dir():
             raise AegisError(
                 f"'{policy}', a file",
@@ -155,6 +160,18 @@ def _warn(pair: Pair, rows: _Rows, beside: Contents, on_event: OnEvent) -> None:
         text = (
             f"'{own[0]}' stays as it was, since it differs from '{own[1]}', and the VLM has one "
             "tensor for both: what the policy computes with it does not follow the VLM"
+        )
+        on_event(Warned("insert", text))
+    if (pair.vlm_at.parent / checkpoint.EXPERT).is_file():
+        text = (
+            "the VLM was trained together with another action expert, which is not put in: the "
+            "policy's own expert has not learned with it. Roll the new policy out before you use it"
+        )
+        on_event(Warned("insert", text))
+    if others := pair.match.others:
+        text = (
+            f"the policy has another VLM of the same names, which stays as it was: under "
+            f"{few(list(map(repr, others)))}"
         )
         on_event(Warned("insert", text))
     named = {*rows.source, *rows.source.values()}

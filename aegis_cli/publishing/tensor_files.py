@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
+import re
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from io import BufferedReader
@@ -68,25 +70,34 @@ class Tensors:
     def rows(self, name: str, first: int, last: int) -> Tensor:
         """Rows of a tensor; a scalar is returned whole.
 
-        If PyTorch's type is not known here, each row is returned as its bytes.
+        If PyTorch's type is not known here, each row is returned as its bytes. If rows do not begin
+        at whole bytes, all bytes are returned as one row.
 
         They are read and not memory-mapped, since mapped pages of a large model fill memory too.
 
         Raises:
-            AegisError: the file has become shorter since it was opened.
+            AegisError: the file has become shorter since it was opened, or only some rows are asked
+                for that do not begin at whole bytes.
         """
         part, spec = self._parts[name], self.specs[name]
         start, end = part.offsets[name]
         rows = spec.shape[0] if spec.shape else 1
-        a_row = (end - start) // max(1, rows)
+        packed = bool(spec.shape) and _row_bits(spec) % 8 != 0
+        if packed and last - first < rows:
+            raise AegisError(
+                f"'{name}' in '{part.path}' has rows of {_row_bits(spec)} bits",
+                "rows of whole bytes, or a table with as many rows as the other model's",
+                "store the tensor in a type of 8 bits or more",
+            )
+        count, a_row = (1, end - start) if packed else (last - first, (end - start) // max(1, rows))
         file = self._files[part.path]
-        file.seek(len(part.head) + start + first * a_row)
-        values = torch.empty((last - first) * a_row, dtype=torch.uint8)
+        file.seek(len(part.head) + start + (0 if packed else first * a_row))
+        values = torch.empty(count * a_row, dtype=torch.uint8)
         if values.numel() and file.readinto(values.numpy().data) != values.numel():
             raise AegisError(f"'{part.path}' has become shorter", "a complete file", _AGAIN)
         dtype = {**TYPES, **_WHOLE}.get(spec.dtype)
         if dtype is None:
-            return values.view(last - first, a_row) if spec.shape else values
+            return values.view(count, a_row) if spec.shape else values
         shape = (last - first, *spec.shape[1:]) if spec.shape else ()
         return values.view(dtype).reshape(shape)
 
@@ -203,8 +214,8 @@ def retyped(part: TensorFile, types: Mapping[str, str]) -> TensorFile:
     if all(types.get(name, spec.dtype) == spec.dtype for name, spec in part.specs.items()):
         return part
     specs = {n: Spec(spec.shape, types.get(n, spec.dtype)) for n, spec in part.specs.items()}
-    # With the widest types first, every tensor is aligned. Types of one byte come last.
-    names = sorted(specs, key=lambda n: (-_size(specs[n].dtype), n))
+    # With the widest types first, every tensor is aligned. Types of one byte or less come last.
+    names = sorted(specs, key=lambda n: (-_bits(specs[n].dtype), n))
     table: dict[str, Any] = {} if part.metadata is None else {"__metadata__": dict(part.metadata)}
     offsets, end = {}, 0
     for name in names:
@@ -219,29 +230,37 @@ def retyped(part: TensorFile, types: Mapping[str, str]) -> TensorFile:
     return TensorFile(part.path, head, in_order, offsets, part.metadata)
 
 
-_BYTES = {"64": 8, "32": 4, "16": 2}
+_BITS = re.compile(r"(?:BOOL|[A-Z]+(\d+))(?:_|$)")  # F32, U8, F8_E4M3, F4, F6_E2M3
 
 
-def _size(dtype: str) -> int:
-    """Bytes of one number."""
-    return next((size for bits, size in _BYTES.items() if dtype.endswith(bits)), 1)
+def _bits(dtype: str) -> int:
+    """Bits of one number: of types such as F4, several numbers share a byte."""
+    found = _BITS.match(dtype)
+    return 8 if found is None or found[1] is None else int(found[1])
 
 
 def nbytes(spec: Spec) -> int:
     """Bytes that a tensor takes in a file."""
-    count = 1
-    for size in spec.shape:
-        count *= size
-    return count * _size(spec.dtype)
+    return math.prod(spec.shape) * _bits(spec.dtype) // 8
+
+
+def _row_bits(spec: Spec) -> int:
+    return math.prod(spec.shape[1:]) * _bits(spec.dtype)
 
 
 def blocks(spec: Spec) -> Iterator[tuple[int, int]]:
-    """The first row and the row after the last one of each block of a tensor, in turn."""
+    """The first row and the row after the last one of each block of a tensor, in turn.
+
+    A tensor whose rows do not begin at whole bytes is one block.
+    """
     if not spec.shape:
         yield 0, 1
         return
     rows = spec.shape[0]
-    a_row = max(1, nbytes(spec) // max(1, rows))
+    if _row_bits(spec) % 8:
+        yield 0, rows
+        return
+    a_row = max(1, _row_bits(spec) // 8)
     at_once = max(1, _AT_ONCE // a_row)
     for first in range(0, rows, at_once):
         yield first, min(rows, first + at_once)
@@ -273,7 +292,7 @@ def equal(tensors: Tensors, one: str, other: str) -> bool:
     spec, second = tensors.specs[one], tensors.specs[other]
     if spec != second and not (spec.shape == second.shape and spec.is_float and second.is_float):
         return False
-    narrow = TYPES.get(min(spec.dtype, second.dtype, key=_size))
+    narrow = TYPES.get(min(spec.dtype, second.dtype, key=_bits))
 
     def rows(name: str, part: tuple[int, int]) -> Tensor:
         found = tensors.rows(name, *part)

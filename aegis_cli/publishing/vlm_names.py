@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from aegis_cli.common import commands
 from aegis_cli.common.errors import AegisError, few
 
 # Parts of names that some releases of transformers have and others do not:
@@ -68,6 +69,7 @@ class Match:
             and the policy's name of that other one; None if the policy has at most one of them, or
             the VLM has both.
         more: the policy's names under the prefix that the VLM does not have.
+        others: prefixes of further VLMs with the same names and shapes, one of which was chosen.
     """
 
     prefix: str
@@ -76,6 +78,24 @@ class Match:
     kept: tuple[Kept, ...]
     second: tuple[str, str] | None
     more: tuple[str, ...]
+    others: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What a command was given, for the search and for its errors.
+
+    Attributes:
+        policy, vlm: their names, as the user gave them.
+        prefix: which of several VLMs to take, by the beginning of its tensors' names; None: the
+            only one.
+        command: the words of the command, without the prefix.
+    """
+
+    policy: str
+    vlm: str
+    prefix: str | None = None
+    command: tuple[str, ...] = ()
 
 
 def key(name: str) -> str:
@@ -104,19 +124,20 @@ def pair_of_tables(specs: Specs) -> tuple[str, str] | None:
     return (named[TABLE], named[HEAD]) if TABLE in named and HEAD in named else None
 
 
-def match(base: Specs, policy: Specs, tied: bool, called: tuple[str, str]) -> Match:
+def match(base: Specs, policy: Specs, tied: bool, asked: Asked) -> Match:
     """Find the VLM's tensors in the policy.
 
     Args:
         base: the VLM's tensors, by their names in the file.
         policy: all of the policy's tensors.
         tied: whether the VLM's table and head, if it has both, are the same.
-        called: names of the policy and the VLM in errors.
 
     Raises:
-        AegisError: the policy does not have them, has them twice, in other shapes or not as plain
-            weights, or lacks more of them than the layers after the last one that it computes.
+        AegisError: the policy does not have them, has them twice and no prefix was given, has them
+            in other shapes or not as plain weights, or lacks more of them than the layers after the
+            last one that it computes.
     """
+    called = asked.policy, asked.vlm
     named = {key(name): name for name in base}
     if len(named) < len(base):
         twice = sorted(name for name in base if named[key(name)] != name)
@@ -125,7 +146,7 @@ def match(base: Specs, policy: Specs, tied: bool, called: tuple[str, str]) -> Ma
             "a model with one tensor of each name",
             "download or export the model again",
         )
-    prefix, found = _under_one_prefix(named, base, policy, called)
+    prefix, found, others = _under_one_prefix(named, base, policy, asked)
     own = {name: found[each] for each, name in named.items() if each in found}
     behind = {key(name.removeprefix(prefix)): name for name in policy if name.startswith(prefix)}
     words = {each: behind[each] for each in (TABLE, HEAD) if each in behind}
@@ -134,7 +155,9 @@ def match(base: Specs, policy: Specs, tied: bool, called: tuple[str, str]) -> Ma
     kept = _kept(named, base, own, called)
     used = {*own.values(), *(second or ())}
     prefix = _common(used)  # includes a `model.` that keys ignore
-    more = tuple(sorted(n for n in policy if n.startswith(prefix) and n not in used))
+    beside = tuple(other for other in others if other.startswith(prefix))
+    own_names = (n for n in policy if n.startswith(prefix) and not n.startswith(beside))
+    more = tuple(sorted(n for n in own_names if n not in used))
     _check_plain(used, more, called)
     _check_depth(prefix, more, named, called)
     rows = {
@@ -142,7 +165,7 @@ def match(base: Specs, policy: Specs, tied: bool, called: tuple[str, str]) -> Ma
         for name, other in own.items()
         if base[name].shape != policy[other].shape
     }
-    return Match(prefix, own, rows, kept, second, more)
+    return Match(prefix, own, rows, kept, second, more, others)
 
 
 def _is_language(found: str) -> bool:
@@ -158,9 +181,10 @@ def _layer(found: str) -> int | None:
 
 
 def _under_one_prefix(
-    named: Mapping[str, str], base: Specs, policy: Specs, called: tuple[str, str]
-) -> tuple[str, dict[str, str]]:
-    """The prefix of the VLM in the policy, and the policy's names by key."""
+    named: Mapping[str, str], base: Specs, policy: Specs, asked: Asked
+) -> tuple[str, dict[str, str], tuple[str, ...]]:
+    """The prefix of the VLM in the policy, the policy's names by key, and other VLMs' prefixes."""
+    called = asked.policy, asked.vlm
     places = _places(named, policy)
     # An action expert has layers with these names too, but no vision part.
     whole = {
@@ -172,28 +196,66 @@ def _under_one_prefix(
         raise _nothing(places, len(base), policy, called)
     # `model.vlm.` and `model.vlm.model.` have the same tensors; the shorter one also has the head.
     found = _without_parts(whole)
-    if len(found) > 1:
-        alike = [p for p in found if all(_fits(base, policy, named, whole[p], e) for e in whole[p])]
-        found = alike if len(alike) == 1 else found
-    if len(found) > 1:
-        raise AegisError(
-            f"{len(found)} VLMs in '{called[0]}' that have the names of '{called[1]}': under "
-            f"{few([repr(prefix) for prefix in found])}",
-            "a policy with one of them",
-            "leave the other one's tensors out of the file, as an average of the weights",
+    # One of other shapes is no candidate, unless there is nothing else: then they are compared.
+    fitting = [p for p in found if all(_fits(base, policy, named, whole[p], e) for e in whole[p])]
+    candidates = fitting or found
+    if asked.prefix is not None:
+        prefix = _chosen(asked.prefix, found, candidates, whole, asked)
+    elif len(candidates) > 1:
+        raise _several(
+            f"{len(candidates)} VLMs in '{called[0]}' that have the names of '{called[1]}'",
+            candidates,
+            asked,
         )
-    prefix = found[0]
+    else:
+        prefix = candidates[0]
     chosen = {}
     for each, names in whole[prefix].items():
-        fitting = [n for n in names if _alike(base[named[each]], policy[n], each)] or names
-        if len(fitting) > 1:
+        alike = [n for n in names if _alike(base[named[each]], policy[n], each)] or names
+        if len(alike) > 1:
             raise AegisError(
-                f"'{named[each]}' of '{called[1]}' more than once in '{called[0]}': {few(fitting)}",
+                f"'{named[each]}' of '{called[1]}' more than once in '{called[0]}': {few(alike)}",
                 "one tensor of each name",
                 "leave the others out of the file",
             )
-        chosen[each] = fitting[0]
-    return prefix, chosen
+        chosen[each] = alike[0]
+    others = tuple(other for other in candidates if other != prefix)
+    return prefix, chosen, others
+
+
+def _chosen(
+    given: str,
+    found: Sequence[str],
+    candidates: Sequence[str],
+    whole: Collection[str],
+    asked: Asked,
+) -> str:
+    """The prefix of the VLM that a user has chosen, by it or by the beginning of it.
+
+    Args:
+        found: the prefixes of all VLMs, of which the candidates have the right shapes.
+        whole: these, and the longer ones that have some of the same tensors.
+    """
+    wanted = f"{given.rstrip('.')}." if given else ""
+    if wanted in whole:  # perhaps a longer one, as the report names it
+        return max((prefix for prefix in found if wanted.startswith(prefix)), key=len)
+    below = [prefix for prefix in candidates if prefix.startswith(wanted)]
+    if len(below) == 1:
+        return below[0]
+    has = f"{len(below)} VLMs" if below else "no VLM"
+    what = f"{has} under --prefix '{given}' in '{asked.policy}'"
+    raise _several(what, below or candidates, asked)
+
+
+def _several(found: str, candidates: Sequence[str], asked: Asked) -> AegisError:
+    """The error for a policy of whose VLMs one has to be chosen."""
+    there = ", ".join(repr(prefix) if prefix else "'' (no prefix)" for prefix in candidates)
+    example = commands.aegis(*asked.command, "--prefix", candidates[0].rstrip("."))
+    return AegisError(
+        f"{found}: under {there}",
+        "one of these, such as the weights that the robot acts with, or their average (EMA)",
+        f"choose it: {example}",
+    )
 
 
 def _common(names: Collection[str]) -> str:
@@ -365,9 +427,12 @@ def _kept(
             "give the VLM that the policy was made from; of a policy with an adapter, "
             "merge that first",
         )
-    span = f"layers {first} to {max(layers)}" if first < max(layers) else f"layer {first}"
+    span, they = f"layer {first}", "it"
+    if first < max(layers):
+        span, they = f"layers {first} to {max(layers)}", "them"
+    lacks = f"the policy does not have {they}, so {they.replace('them', 'they')} never learned"
     kinds = (
-        (f"language {span}", "the policy does not have them, so they never learned", upper),
+        (f"language {span}", lacks, upper),
         ("behind the layers", "the policy does not have it, so it never learned", after),
         ("buffers", "they do not learn", buffers),
     )

@@ -27,6 +27,7 @@ from aegis_cli.studies.comparison import (
 )
 from aegis_cli.studies.pipeline import PipelineReport
 from aegis_cli.training import folder
+from aegis_cli.training import inputs as places
 from aegis_cli.training.up_to_date import refuse_unfinished
 
 _VIDEOS = (".mp4", ".gif", ".webm")
@@ -253,7 +254,9 @@ def _anchor(
     if not read:
         return AnchorUse("a file given to aegis probe", read)
     digest = artifacts.read_header(path / "ledger.safetensors").inputs.get("anchor", "unknown")
-    return AnchorUse(f"a file with sha256 {digest[:12]}", read)
+    kept = places.of(path)
+    name = "a file" if kept is None or kept.anchor is None else f"'{Path(kept.anchor).name}'"
+    return AnchorUse(f"{name} with sha256 {digest[:12]}", read)
 
 
 def _samples(path: Path, recipe: recipes.Recipe) -> int:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, cast
 
 from aegis_cli import methods, recipes, sim
-from aegis_cli.anchors import measure
+from aegis_cli.anchors import anchor_file, measure
 from aegis_cli.common import artifacts, files, gl, leading, machine, version
 from aegis_cli.common.errors import AegisError, Diverged
 from aegis_cli.common.events import OnEvent, Progress, Warned
@@ -788,7 +788,9 @@ class PolicyRunner:
         before = self.before(recipe, settings, split)
         anchor = None
         if "moments" in recipe.anchor.parts:
-            anchor = measured.path, backbones.load(recipe.backbone).fingerprint()
+            fingerprint = backbones.load(recipe.backbone).fingerprint()
+            wanted = anchor_file.Wanted(fingerprint, recipe.backbone, "--baseline ")
+            anchor = measured.path, wanted
         after, layers, image_size = leading.together(
             probe.answers,
             str(self._policy(label, recipe)),

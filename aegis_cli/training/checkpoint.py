@@ -25,7 +25,7 @@ from safetensors import SafetensorError
 from torch import Tensor
 
 from aegis_cli import recipes, sim
-from aegis_cli.common import artifacts, files, hub
+from aegis_cli.common import artifacts, commands, files, hub
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.ranks import sharded_as
 from aegis_cli.common.state_dicts import check_state, outline, reading_meta, shape_from
@@ -39,6 +39,7 @@ from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.models.expert import ActionExpert, ExpertShape, check_fit
 from aegis_cli.models.policy import Policy
 from aegis_cli.models.policy_meta import PolicyMeta
+from aegis_cli.training import inputs as places
 from aegis_cli.training import optimizer_state
 from aegis_cli.training.average import Average
 
@@ -294,13 +295,26 @@ def kept_state(run: Path) -> Path:
     """
     state = last(run) / STATE
     if not state.is_file():
-        raise AegisError(
-            f"no training state in '{run}', as in a run that aegis merge wrote",
-            "a run that aegis train wrote",
-            "continue the run that was merged, or begin another with what this one has learned: "
-            f"--set 'backbone={run}' --set 'expert.start={run}'",
-        )
+        raise _without_state(run)
     return state
+
+
+def _without_state(run: Path) -> AegisError:
+    """The error for a run that cannot be resumed, with the commands that go on from it."""
+    origin, kept = places.merged_from(run), places.of(run)
+    merged = "as in a run that aegis merge wrote"
+    on = "continue the run that was merged"
+    if origin is not None:
+        merged = f"which aegis merge made from '{origin}'"
+        on += f": {commands.aegis('train', origin)}"
+    demos = [] if kept is None else [word for each in kept.demos for word in ("--demos", each)]
+    learned = ["--set", f"backbone={run}", "--set", f"expert.start={run}"]
+    again = commands.aegis("train", run / "recipe.yaml", *demos, *learned, "--out", "RUN")
+    return AegisError(
+        f"no training state in '{run}', {merged}",
+        "a run that aegis train wrote",
+        f"{on}; or begin another with what this one has learned: {again}",
+    )
 
 
 def last(folder: Path) -> Path:
@@ -312,6 +326,8 @@ def last(folder: Path) -> Path:
     path = Path(folder) / "checkpoints" / LAST
     if not (path / EXPERT).is_file():
         model_folder.refuse_foreign_policy(Path(folder))
+        if model_folder.is_model(Path(folder)):
+            raise _without_expert(folder)
         raise AegisError(
             f"no checkpoint in '{folder}'",
             "a run folder with checkpoints/last, the folder of one of its checkpoints, or a "
@@ -319,6 +335,20 @@ def last(folder: Path) -> Path:
             f"train one with aegis train … --out RUN{_not_asked(folder)}",
         )
     return path
+
+
+def _without_expert(folder: Path) -> AegisError:
+    """The error for a model by itself, such as one that `aegis extract` or `aegis merge` wrote."""
+    train = commands.aegis(
+        "train", "RECIPE", "--set", f"backbone={folder}", "--demos", "PATH", "--out", "RUN"
+    )
+    back = commands.aegis("insert", folder, "--into", "POLICY", "--out", "FOLDER")
+    return AegisError(
+        f"no checkpoint in '{folder}', a model by itself, without an action expert",
+        "a trained policy: a run's folder, or that of one of its checkpoints",
+        f"train one from it: {train}; a VLM that aegis extract took out of another program's "
+        f"policy goes back into that by {back}",
+    )
 
 
 def _not_asked(folder: Path) -> str:
@@ -444,9 +474,15 @@ def _load_expert(
     Args:
         backbone: the backbone that it has to belong to; None: any.
     """
-    artifact = artifacts.load(
-        file, "expert", fingerprint=None if backbone is None else backbone.fingerprint()
-    )
+    owner = None
+    if backbone is not None:
+        own = file.parent / BACKBONE
+        fix = (
+            f"bring '{own}' back as it was written beside the expert, from a copy of the run; or "
+            "give another checkpoint of the run"
+        )
+        owner = artifacts.Owner(backbone.fingerprint(), str(own), fix)
+    artifact = artifacts.load(file, "expert", owner=owner)
     meta, tensors = cast(PolicyMeta, artifact.header.meta), artifact.tensors
     with reading_meta(file):
         shape = shape_from(ExpertShape, artifact.header.meta["shape"], file, len(tensors))

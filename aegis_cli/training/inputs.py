@@ -18,6 +18,7 @@ from aegis_cli.data.selection import Paths
 
 NAME = "inputs.json"
 _RELATIVE = "relative"  # a key: the places relative to the run
+_MERGED_FROM = "merged_from"  # a key: the run that aegis merge has made this one from
 _BEGAN_IN = "began_in"  # a key: the folder that the recipe's own paths are relative to
 
 
@@ -54,21 +55,31 @@ def is_gone(place: str) -> bool:
     return path.is_absolute() and not path.exists()  # places of files are kept as absolute paths
 
 
-def keep(out: Path, inputs: Inputs, place: Path | None = None, began: Path | None = None) -> None:
+def keep(
+    out: Path,
+    inputs: Inputs,
+    place: Path | None = None,
+    began: Path | None = None,
+    merged: Path | None = None,
+) -> None:
     """Write the inputs into a run's folder, both as absolute paths and relative to it.
 
     Args:
         place: where the folder will lie later; None: where it is now.
         began: the folder that the run was begun in; None: what the run says, else the current
             folder.
+        merged: the run that this one was merged from; None: it was trained.
     """
     here, first = (place or out).absolute(), str(began or began_in(out) or Path.cwd())
 
     def relative(given: str) -> str:
         return os.path.relpath(given, here) if Path(given).is_absolute() else given
 
-    seen = asdict(inputs.each(relative)) | {_BEGAN_IN: relative(first)}
-    files.save_json(out / NAME, asdict(inputs) | {_BEGAN_IN: first, _RELATIVE: seen})
+    others = {_BEGAN_IN: first}
+    if merged is not None:
+        others[_MERGED_FROM] = str(merged.absolute())
+    seen = asdict(inputs.each(relative)) | {key: relative(at) for key, at in others.items()}
+    files.save_json(out / NAME, asdict(inputs) | others | {_RELATIVE: seen})
 
 
 def began_in(out: Path) -> Path | None:
@@ -76,10 +87,19 @@ def began_in(out: Path) -> Path | None:
 
     None if the run does not say, or the folder is gone.
     """
+    return _folder(out, _BEGAN_IN)
+
+
+def merged_from(out: Path) -> Path | None:
+    """The run that this one was merged from, likewise; None also for a run that was trained."""
+    return _folder(out, _MERGED_FROM)
+
+
+def _folder(out: Path, key: str) -> Path | None:
     said = files.load_json(out / NAME) if (out / NAME).is_file() else None
     if not isinstance(said, dict) or not isinstance(said.get(_RELATIVE), dict):
         return None
-    places = [said.get(_BEGAN_IN), said[_RELATIVE].get(_BEGAN_IN)]
+    places = [said.get(key), said[_RELATIVE].get(key)]
     known = [out.absolute() / place for place in places if isinstance(place, str)]
     return next((Path(os.path.normpath(path)) for path in known if path.is_dir()), None)
 

@@ -80,7 +80,7 @@ def load(
     backbone = backbones.load(recipe.backbone).to("cpu" if shards else device)
     fingerprint = backbone.fingerprint()
     watched = WatchedFiles([] if anchor is None else [anchor])
-    measured = None if anchor is None else _measured(anchor, fingerprint, method, device)
+    measured = None if anchor is None else _measured(anchor, fingerprint, recipe, method, device)
     _check_parts(method, measured, recipe)
     # Last, since this may decode hours of video.
     recorded = _demonstrations(recipe, backbone, demos, on_event, ranks)
@@ -247,9 +247,13 @@ def check_cameras(backbone: Backbone, recipe: Recipe | RobotStreamRecipe) -> Non
         )
 
 
-def _measured(path: Path, fingerprint: str, method: Method, device: torch.device) -> Anchor:
+def _measured(
+    path: Path, fingerprint: str, recipe: Recipe, method: Method, device: torch.device
+) -> Anchor:
     """The parts of the anchor that the method reads."""
-    found = anchor_file.only(anchor_file.load(path, fingerprint), method.needs)
+    measuring = _measuring(recipe, sorted(method.needs)) if method.needs else None
+    wanted = anchor_file.Wanted(fingerprint, recipe.backbone, "--set backbone=", measuring)
+    found = anchor_file.only(anchor_file.load(path, wanted), method.needs)
     return anchor_file.to_device(found, device)
 
 

@@ -344,11 +344,37 @@ def _other_inputs(run: TrainingRun, there: Mapping[str, str], places: inputs.Inp
                 "bring them back as they were, or begin another run with what this one has "
                 f"learned: {folder.learned(out)}, in another --out",
             )
-    return AegisError(
-        f"{mixture.differing(there, run.inputs)} than the run in '{out}' began with",
-        "the same inputs",
-        "give the files the run began with, or start anew in another --out",
-    )
+    found = f"{mixture.differing(there, run.inputs)} than the run in '{out}' began with"
+    fix = "give the files the run began with, or start anew in another --out"
+    changed, moved = _differing_places(run, there, places, begun)
+    if changed or moved:
+        found += f": {'; '.join([*moved, *changed])}"
+    if moved and not changed and checkpoint.begun(out):
+        fix = f"go on with its own: {commands.aegis('train', out)}, or start anew in another --out"
+    return AegisError(found, "the same inputs", fix)
+
+
+def _differing_places(
+    run: TrainingRun, there: Mapping[str, str], places: inputs.Inputs, begun: Recipe
+) -> tuple[list[str], list[str]]:
+    """Which files with other contents are at the run's own paths, and which at others."""
+    kept, recipe = inputs.of(run.out), run.recipe
+    known = {
+        "anchor": (None if kept is None else kept.anchor, places.anchor),
+        "backbone": (begun.backbone, recipe.backbone),
+        "expert": (begun.expert.start, recipe.expert.start),
+    }
+    if kept is not None and len(kept.demos) == len(places.demos) == 1:
+        known["demos"] = (kept.demos[0], places.demos[0])
+    changed, moved = [], []
+    for name, (before, now) in known.items():
+        if there.get(name) == run.inputs.get(name) or before is None or now is None:
+            continue
+        if before == now:
+            changed.append(f"'{now}' has changed since")
+        else:
+            moved.append(f"'{now}' instead of '{before}'")
+    return changed, moved
 
 
 @contextmanager

@@ -47,6 +47,8 @@ def smolvla_gives_and_takes_its_vlm(folder: Path) -> str:
     assert kept["what"] == "language layer 1", kept
     again = SmolVLAPolicy.from_pretrained(home / "back", strict=True)
     check_equal(policy, again)
+    go_on(home, folder / "dataset")
+    SmolVLAPolicy.from_pretrained(home / "after", strict=True)
     return f"{report['taken']} of {report['tensors']} tensors, {kept['what']} put back"
 
 
@@ -132,6 +134,20 @@ def there_and_back(home: Path) -> dict[str, Any]:
 def probe(home: Path) -> None:
     """Measure what the policy has forgotten, if only whether that can be done."""
     command("aegis", "probe", home / "vlm", "--baseline", home / "base", "--questions", "14")
+
+
+def go_on(home: Path, dataset: Path) -> None:
+    """Train the extracted VLM further with a new expert, merge it, and put it into the policy."""
+    anchor, run, vlm = home / "anchor.safetensors", home / "run", home / "vlm"
+    measured = ("--samples", "20", "--parts", "inputs", "--out", anchor)
+    command("aegis", "anchor", "--backbone", vlm, *measured)
+    settings = (f"backbone={vlm}", "train.steps=4", "train.warmup=1", "train.batch_size=4")
+    changes = [word for each in settings for word in ("--set", each)]
+    given = ("--demos", dataset, "--anchor", anchor, "--out", run)
+    command("aegis", "train", "quickstart", "--method", "nullspace", *given, *changes)
+    half = ("--method", "linear", "--strength", "0.5", "--out", home / "merged")
+    command("aegis", "merge", run, *half)
+    command("aegis", "insert", home / "merged", "--into", home / "policy", "--out", home / "after")
 
 
 def check_taken(home: Path, own: Mapping[str, Tensor]) -> None:

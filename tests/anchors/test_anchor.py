@@ -106,6 +106,10 @@ def test_layers_differ_and_measure_what_the_model_does(tiny: EmbeddedVLM, asked:
     )
 
 
+def wanted(model: EmbeddedVLM) -> anchor_file.Wanted:
+    return anchor_file.Wanted(model.fingerprint(), "tiny", "--backbone ")
+
+
 def test_artifact_and_report(
     tiny: EmbeddedVLM, tiny_folder: Path, asked: VQASet, tmp_path: Path
 ) -> None:
@@ -120,8 +124,10 @@ def test_artifact_and_report(
     report = measure.run(
         str(tiny_folder), settings, tmp_path / "a.safetensors", on_event=events.append
     )
-    artifact = artifacts.load(tmp_path / "a.safetensors", "anchor", fingerprint=tiny.fingerprint())
+    artifact = artifacts.load(tmp_path / "a.safetensors", "anchor")
+    assert artifact.header.fingerprint == tiny.fingerprint()
     meta = {
+        "backbone": str(tiny_folder),
         "vqa": "scenes",
         "samples": SAMPLES,
         "parts": ["fisher", "inputs", "moments"],
@@ -261,7 +267,7 @@ def test_frames_are_read_with_their_instructions(
     image, text = moments.measure_passes(
         tiny, [frames], lambda rows: (shown.images(rows), texts), len(frames)
     )
-    found = anchor_file.load(out, tiny.fingerprint())
+    found = anchor_file.load(out, wanted(tiny))
     assert_same(list(found.image), image)
     assert_same(list(found.text), text)
     assert report.text_tokens == sum(len(t.split()) + 1 for t in texts)
@@ -299,7 +305,7 @@ def test_only_frames_of_the_chosen_episodes_are_read(
     image, _ = moments.measure_passes(
         tiny, [frames], lambda rows: (shown.images(rows), texts), len(frames)
     )
-    assert_same(list(anchor_file.load(out, tiny.fingerprint()).image), image)
+    assert_same(list(anchor_file.load(out, wanted(tiny)).image), image)
     assert artifacts.read_header(out).meta["only"] == "0,2-3"
 
 

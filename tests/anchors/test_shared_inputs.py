@@ -149,7 +149,7 @@ def test_no_gradient_of_a_parameter_is_made() -> None:
 
 def saved(path: Path, anchor: Anchor) -> Anchor:
     anchor_file.save(path, anchor, fingerprint="0" * 64, meta={})
-    return anchor_file.load(path, "0" * 64)
+    return anchor_file.load(path, anchor_file.Wanted("0" * 64, "model", "--backbone "))
 
 
 def test_a_shared_spectrum_is_in_the_file_once(tmp_path: Path) -> None:

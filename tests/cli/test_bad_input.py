@@ -105,7 +105,8 @@ def test_truncated_files(
     bad(*command, says=(path.name, "truncated"))
 
 
-@pytest.mark.parametrize(("victim", "command"), READERS)
+# `inspect` tells what is in such a file instead.
+@pytest.mark.parametrize(("victim", "command"), [r for r in READERS if r[1][0] != "inspect"])
 def test_foreign_files(
     victim: str, command: tuple[str, ...], bad: Callable[..., str], place: Path
 ) -> None:

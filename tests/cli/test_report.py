@@ -261,6 +261,9 @@ def test_an_anchor_that_no_training_read_is_what_the_drift_is_measured_against(
     page, document = reported(aegis, read)
     assert document["anchor"]["read"] is True and "no training used it" not in page.said
     assert "--anchor" in document["commands"][0]
+    files.save_json(read / "inputs.json", {"demos": ["/data/a.sft"], "anchor": "/data/mine.sft"})
+    told = reported(aegis, read)[1]["anchor"]["measured_on"]
+    assert told.startswith("'mine.sft' with sha256 ")
     files.save_json(naive / "train.json", {"method": "naive"})
     _, document = reported(aegis, naive)
     assert document["anchor"]["measured_on"] == "3,000 questions of scenes"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shlex
 import shutil
 from collections.abc import Callable
@@ -220,7 +221,7 @@ def test_a_run_goes_on_with_its_backbone_at_another_place(
     run = cut(place, "naive")
     make_tiny(seed=1).save(place / "other")
     says = "a different backbone than the run in 'cut' began with"
-    bad("train", "cut", "--set", "backbone=other", says=(says,))
+    bad("train", "cut", "--set", "backbone=other", says=(says, "'other' instead of '", "train cut"))
     moved = "--set", "backbone=model.safetensors"
     code, _, err = aegis("train", "cut", *moved)
     assert code == 0 and steps_of(run) == 3, err
@@ -256,7 +257,8 @@ def test_other_demonstrations_are_refused(place: Path, bad: Bad, aegis: Aegis) -
     run = cut(place)
     code, _, err = aegis("demos", "reach", "--episodes", 8, "--seed", 5, "--out", "new.safetensors")
     assert code == 0, err
-    says = "a different demos than the run", "the run began with"
+    names = f"'{place}/new.safetensors' instead of '{place}/demos.safetensors'"
+    says = "a different demos than the run", names, f"go on with its own: aegis train {run}"
     bad("train", run, "--demos", "new.safetensors", says=says)
 
 
@@ -406,6 +408,47 @@ def test_a_merged_run_is_evaluated_on_what_its_training_learned_from(
     code, out, err = aegis("evaluate", "merged", "--frames", 8, "--json")
     assert code == 0 and json.loads(out)["data"] == str(place / "demos.safetensors"), err
     assert json.loads(out)["split"] == "validation"
+
+
+def test_a_merged_run_is_refused_with_the_commands_that_go_on(
+    place: Path, aegis: Aegis, bad: Bad, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Both are as they have to be typed, also after both runs were moved."""
+    run = cut(place, "naive")
+    linear = "--method", "linear", "--strength", 0.5
+    assert aegis("merge", run, *linear, "--out", "merged")[0] == 0
+    moved = place.rename(tmp_path / "moved")
+    monkeypatch.chdir(moved)
+    origin = moved / "cut"
+    said = bad("train", "merged", says=(f"which aegis merge made from '{origin}'",))
+    own, anew = re.findall(r"aegis (train [/m].+?)(?:; |$)", " ".join(said.split()))
+    assert own == f"train {origin}"
+    learned = "--set backbone=merged --set expert.start=merged --out RUN"
+    assert anew == f"train merged/recipe.yaml --demos {moved}/demos.safetensors {learned}"
+    for words in (own, anew):
+        code, _, err = aegis(*shlex.split(words))
+        assert code == 0, err
+    assert steps_of(moved / "RUN") == 3
+    # Where the run is gone, or an earlier version has not named it, the advice is without it.
+    shutil.rmtree(origin)
+    bad("train", "merged", says=("continue the run that was merged; or begin another",))
+    (moved / "merged" / inputs.NAME).unlink()
+    bad("train", "merged", "--demos", "demos.safetensors", says=(learned,))
+
+
+@pytest.mark.parametrize("what", ["backbone", "policy"])
+def test_a_model_instead_of_a_recipe_is_named_in_one(
+    what: str, place: Path, aegis: Aegis, bad: Bad
+) -> None:
+    run = cut(place, "naive")
+    assert aegis("export", run, "--format", "aegis", "--out", "policy")[0] == 0
+    given = "policy" if what == "policy" else "policy/backbone"
+    said = bad("train", given, "--out", "new", says=(f"--set backbone={given}",))
+    assert ("expert.start" in said) == (what == "policy")
+    command = re.findall(r"aegis (train RECIPE .+?)$", " ".join(said.split()))[0]
+    named = command.replace("RECIPE", "small.yaml").replace("PATH", "demos.safetensors")
+    code, _, err = aegis(*shlex.split(named), "--method", "naive")
+    assert code == 0 and (place / "RUN" / "checkpoints").is_dir(), err
 
 
 @pytest.mark.parametrize(

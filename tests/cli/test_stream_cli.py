@@ -222,7 +222,8 @@ def test_damaged_experts_are_refused(aegis: Aegis, place: Path, bad: Callable[..
         bad("probe", "run", says=("NaN", first))
         path.write_bytes(kept)
         forge(path, lambda header: header.update(fingerprint="0" * 64))
-        bad("probe", "run", says=("belongs to backbone",))
+        says = (f"run/{name}.safetensors", "not those of 'tiny'", "bring", "train")
+        bad("probe", "run", says=says)
         path.write_bytes(kept)
 
 

@@ -436,11 +436,30 @@ def test_meta_is_finite_and_complete(tmp_path: Path) -> None:
         )
 
 
-def test_fingerprint(tmp_path: Path) -> None:
+def test_a_file_of_another_backbone_is_refused_by_the_names_that_the_user_gave(
+    tmp_path: Path,
+) -> None:
+    """The digests only help to compare; a file of an earlier Aegis has nothing else."""
     path, other = write(tmp_path, "anchor"), "fedcba9876543210" * 4
-    assert artifacts.load(path, "anchor", fingerprint=FINGERPRINT).header.fingerprint == FINGERPRINT
-    refused(path, FINGERPRINT[:12], other[:12], "aegis anchor", kind="anchor", fingerprint=other)
-    refused(write(tmp_path, "expert"), "no fingerprint", other[:12], fingerprint=other)
+
+    def owner(fingerprint: str, name: str = "models/mine") -> artifacts.Owner:
+        return artifacts.Owner(fingerprint, name, "aegis anchor")
+
+    own = artifacts.load(path, "anchor", owner=owner(FINGERPRINT))
+    assert own.header.fingerprint == FINGERPRINT
+    both = f"(digest {FINGERPRINT[:12]}, not {other[:12]})"
+    before = "made with weights that are not those of 'models/mine'"
+    refused(path, before, both, "aegis anchor", kind="anchor", owner=owner(other))
+    refused(write(tmp_path, "expert"), "digest unknown", other[:12], owner=owner(other))
+    meta = {artifacts.BACKBONE: "models/yours"}
+    named = write(tmp_path, "anchor", meta=meta)
+    assert artifacts.made_with(artifacts.read_header(named)) == "models/yours"
+    before = "made with 'models/yours', whose weights are not those of 'models/mine'"
+    refused(named, before, both, owner=owner(other))
+    before = f"'models/yours' when that had other weights (digest {FINGERPRINT[:12]}, now"
+    refused(named, before, owner=owner(other, "models/yours"))
+    odd = write(tmp_path, "anchor", meta={artifacts.BACKBONE: 3})
+    assert artifacts.made_with(artifacts.read_header(odd)) is None
 
 
 def failing(error: BaseException) -> Callable[..., None]:

@@ -230,8 +230,15 @@ def test_without_baseline_and_anchor_there_is_no_drop_and_no_drift(taught: Path)
 
 def test_the_anchor_is_the_baselines(taught: Path, broken: Path, own_anchor: Path) -> None:
     assert asked_of(broken, taught, own_anchor).layers  # the model under test need not own it
-    with pytest.raises(AegisError, match="belongs to backbone"):
+    with pytest.raises(AegisError, match="are not those of") as caught:
         asked_of(taught, broken, own_anchor)
+    # The names that the user gave, and a command for each way on.
+    assert f"'{taught}', whose weights are not those of '{broken}'" in caught.value.found
+    assert f"--baseline {taught}" in caught.value.fix
+    assert f"aegis anchor --backbone {broken} --vqa=scenes" in caught.value.fix
+    with pytest.raises(AegisError, match="are not those of") as caught:
+        asked_of(broken, moments=own_anchor)
+    assert caught.value.fix.endswith(f"--baseline {taught}")
 
 
 def test_batch_size_does_not_show(taught: Path) -> None:

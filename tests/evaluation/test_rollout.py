@@ -30,6 +30,7 @@ from aegis_cli.core.continuation import Continued
 from aegis_cli.data.vqa.metrics import wilson_interval
 from aegis_cli.evaluation import rollout
 from aegis_cli.models import acting
+from aegis_cli.models.policy import Policy
 from aegis_cli.sim.contract import Observation, Step
 from aegis_cli.training import checkpoint, train
 
@@ -484,6 +485,88 @@ def test_an_interrupted_rollout_goes_on_to_the_same_report(
     assert again.episodes_per_s < 1000  # the speed of playing, not of finding
     shutil.rmtree(cache.folder("episodes"))
     assert timeless(rollout.run(run_folder, None, 5, "seen")) == timeless(resumed)
+
+
+class Counted:
+    """Interrupts a rollout after some predictions, and counts these."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.asked, self.until = 0, math.inf
+        plain = Policy.act_from
+
+        def act_from(policy: Policy, *given: Any) -> torch.Tensor:
+            if self.asked >= self.until:
+                raise KeyboardInterrupt
+            self.asked += 1
+            return plain(policy, *given)
+
+        monkeypatch.setattr(Policy, "act_from", act_from)
+
+
+WAYS: list[dict[str, Any]] = [
+    {"replan": 2},
+    {"ensemble": 0.1},
+    {"replan": 2, "delay": 1},
+    {"replan": 2, "delay": 1, "guided": True},
+]
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_a_rollout_interrupted_within_a_group_predicts_nothing_twice(
+    way: dict[str, Any], run_folder: Path, envs: list[Seen], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its episodes repeat the actions that they had, and nothing else of the report differs."""
+    counted = Counted(monkeypatch)
+    whole = rollout.run(run_folder, None, 5, "seen", **way)
+    needed, paths = counted.asked, [env.shown[-1].proprio.tobytes() for env in envs]
+    shutil.rmtree(cache.folder("episodes"))
+    counted.asked, stops = 0, (3, 4, needed - 1)
+    for counted.until in stops:
+        with pytest.raises(KeyboardInterrupt):
+            rollout.run(run_folder, None, 5, "seen", **way)
+        assert counted.asked == counted.until
+    counted.until = math.inf
+    del envs[:]
+    resumed = rollout.run(run_folder, None, 5, "seen", **way)
+    assert counted.asked == needed and timeless(resumed) == timeless(whole)
+    assert [env.shown[-1].proprio.tobytes() for env in envs] == paths
+    assert resumed.episodes_per_s < 1000
+
+
+def test_the_video_of_a_resumed_rollout_is_the_same(
+    run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Byte for byte, since filmed episodes are rendered again."""
+    counted, film = Counted(monkeypatch), tmp_path / "v.mp4"
+    rollout.run(run_folder, None, 3, "seen", film, 2)
+    whole, needed = film.read_bytes(), counted.asked
+    shutil.rmtree(cache.folder("episodes"))
+    counted.asked, counted.until = 0, 5
+    with pytest.raises(KeyboardInterrupt):
+        rollout.run(run_folder, None, 3, "seen", film, 2)
+    counted.until = math.inf
+    rollout.run(run_folder, None, 3, "seen", film, 2)
+    assert film.read_bytes() == whole and counted.asked == needed
+
+
+@pytest.mark.parametrize("damage", ['"type"', '"shape"', '"bytes"', "A"])
+def test_the_beginning_of_a_group_that_is_damaged_is_played_again(
+    damage: str, run_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    counted = Counted(monkeypatch)
+    whole = rollout.run(run_folder, None, 3, "seen", replan=2)
+    needed = counted.asked
+    shutil.rmtree(cache.folder("episodes"))
+    counted.asked, counted.until = 0, 3
+    with pytest.raises(KeyboardInterrupt):
+        rollout.run(run_folder, None, 3, "seen", replan=2)
+    (kept,) = cache.folder("episodes").glob("*.jsonl")
+    text = kept.read_text()
+    assert damage in text
+    kept.write_text(text.replace(damage, damage.replace("A", "B").replace("e", "o"), 1))
+    counted.asked, counted.until = 0, math.inf
+    assert timeless(rollout.run(run_folder, None, 3, "seen", replan=2)) == timeless(whole)
+    assert counted.asked == needed
 
 
 def test_what_was_played_otherwise_is_played_again(

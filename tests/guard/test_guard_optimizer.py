@@ -14,6 +14,7 @@ from samples.tiny import make_tiny
 from torch import Tensor, nn
 
 from aegis_cli.anchors import anchor_file, measure
+from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError
 from aegis_cli.core import nullspace
 from aegis_cli.core.nullspace import Strength
@@ -125,7 +126,7 @@ def test_the_applied_update_is_orthogonal_to_what_questions_span(
     sites = vlm.sites()
     likes = {site: vlm.get_submodule(site).weight for site in sites}
     found = nullspace.protections(
-        anchor_file.load(anchor, base.fingerprint()), likes, Strength(0.9)
+        anchor_file.from_artifact(artifacts.load(anchor, "anchor")), likes, Strength(0.9)
     )
     moved = {n: (after[n] - before[n]) for n in before}
     for site, protection in found.items():

@@ -518,7 +518,8 @@ def test_anchors_and_demonstrations_that_do_not_fit(
     for method, part in (("factors", "curvature"), ("inputs", "inputs")):
         given = (merge_place.run, "--method", method, "--anchor", moments, *write)
         bad(aegis, *given, says=(f"without {part}", f"--parts {part}"))
-    bad(aegis, merge_place.run, "--anchor", anchor_file, *write, says=("belongs to backbone",))
+    says = (f"not those of '{merge_place.base}'", "--base", "aegis anchor --backbone")
+    bad(aegis, merge_place.run, "--anchor", anchor_file, *write, says=says)
     bad(aegis, merge_place.run, "--demos", other, *write, says=("other demonstrations",))
     alone = tmp_path / "alone"
     shutil.copytree(merge_place.run, alone, symlinks=True)
@@ -594,6 +595,9 @@ def test_a_merged_run_is_not_trained_on(
     given = ("--demos", merge_place.demos, "--out", out, "--resume")
     err = refused(aegis("train", out / "recipe.yaml", *given))
     assert "aegis merge" in err
-    # Its folder does not say what it was trained on, and that would not help.
+    # It is not asked for what it was trained on, but a new run is, whose command names that.
     err = refused(aegis("train", out))
-    assert "aegis merge" in err and "--set 'expert.start=" in err and "--demos" not in err
+    assert f"aegis merge made from '{merge_place.run}'" in err
+    assert "does not record" not in err and f"aegis train {merge_place.run};" in err
+    again = f"aegis train {out}/recipe.yaml --demos {merge_place.demos} --set backbone={out}"
+    assert f"{again} --set expert.start={out} --out RUN" in err

@@ -568,9 +568,9 @@ def test_an_anchor_of_another_size(bad: Bad, model: Path) -> None:
         *TRAIN,
         "--set",
         "backbone=model",
-        says=("anchor.safetensors", "belongs to backbone", "aegis anchor"),
+        says=("anchor.safetensors", "not those of 'model'", "aegis anchor --backbone model"),
     )
-    says = ("anchor.safetensors", "belongs to backbone")
+    says = ("anchor.safetensors", "not those of 'model'", "--baseline")
     bad("probe", "model", "--anchor", "anchor.safetensors", "--questions", "7", says=says)
 
 

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import json
+import math
 import os
+import shlex
 import shutil
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -19,6 +22,7 @@ from samples.hub import Hub
 from samples.vqa_files import write_jsonl
 from torch import Tensor
 
+from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import Event, Progress, Warned
 from aegis_cli.models import backbones
@@ -287,6 +291,41 @@ def test_a_base_in_half_precision_rounds_and_says_so(hf_folder: Folder, tmp_path
     assert files_of(tmp_path / "back") == files_of(source)
 
 
+@pytest.mark.parametrize("shape", [(4, 6), (2, 3), (3, 4, 2), (8,), (2,), (1, 2), (0, 3)])
+@pytest.mark.parametrize(("dtype", "bits"), [("F4", 4), ("F6_E2M3", 6), ("F8_E8M0", 8)])
+def test_packed_types_beside_the_vlm_are_copied_whole(
+    dtype: str,
+    bits: int,
+    shape: tuple[int, ...],
+    paligemma: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Of such types several numbers share a byte, and a row may end inside of one."""
+    if math.prod(shape) * bits % 8:
+        shape = (*shape, 4)  # a file holds whole bytes of each tensor
+    count = math.prod(shape) * bits // 8
+    packed = bytes(number % 251 for number in range(count))
+    source = policy(tmp_path / "policy", foreign.moved(paligemma), "pi0 of openpi")
+    add_tensor(source / WEIGHTS, "action_in_proj.packed", dtype, shape, packed)
+    monkeypatch.setattr(tensor_files, "_AT_ONCE", 2)
+    take(source, paligemma, tmp_path / "vlm")
+    insert.run(str(tmp_path / "vlm"), str(source), tmp_path / "back")
+    assert files_of(tmp_path / "back") == files_of(source)
+
+
+def add_tensor(path: Path, name: str, dtype: str, shape: tuple[int, ...], data: bytes) -> None:
+    """Add a tensor of a type that PyTorch may not have to a safetensors file."""
+    raw = path.read_bytes()
+    size = int.from_bytes(raw[:8], "little")
+    table, rest = json.loads(raw[8 : 8 + size]), raw[8 + size :]
+    place = [len(rest), len(rest) + len(data)]
+    table[name] = {"dtype": dtype, "shape": list(shape), "data_offsets": place}
+    head = json.dumps(table).encode()
+    head += b" " * (-len(head) % 8)
+    path.write_bytes(len(head).to_bytes(8, "little") + head + rest + data)
+
+
 def test_a_base_in_shards_gives_its_shards_and_a_true_index(
     paligemma: Path, tmp_path: Path
 ) -> None:
@@ -505,6 +544,110 @@ def test_the_index_of_a_variant_is_not_taken_for_the_models(
     assert any("copied unchanged: model.fp16-00001.safetensors" in text for text in warnings(said))
     (source / f"{WEIGHTS}.index.json").rename(source / "model.ema.safetensors.index.json")
     assert "2 indices" in bad("extract", source, "--base", paligemma)
+
+
+# --- the whole way --------------------------------------------------------------------------------
+
+
+def test_an_extracted_vlm_is_trained_further_merged_and_put_back(
+    smolvlm: Path, demos_file: Path, tmp_path: Path, aegis: Aegis, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The whole way of a policy that was trained elsewhere, command by command."""
+    monkeypatch.chdir(tmp_path)
+    own = foreign.moved(smolvlm)
+    there = {name: t for name, t in own.items() if not foreign.is_layer(name, 1)}
+    source = policy(tmp_path / "policy", there, "smolvla")
+
+    def done(*words: object) -> str:
+        code, _, said = aegis(*words)
+        assert code == 0, said
+        return said
+
+    done("extract", source, "--base", smolvlm, "--out", "vlm")
+    samples = ("--samples", 8, "--batch-size", 8)
+    done("anchor", "--backbone", "vlm", *samples, "--parts", "inputs", "--out", "anchor.sft")
+    assert artifacts.made_with(artifacts.read_header("anchor.sft")) == "vlm"
+    short = ("train.steps=2", "train.warmup=1", "train.batch_size=4", "train.backbone_lr=1e-2")
+    settings = [word for each in ("backbone=vlm", *short) for word in ("--set", each)]
+    given = ("--demos", demos_file, "--anchor", "anchor.sft", "--out", "run")
+    done("train", "quickstart", "--method", "nullspace", *given, *settings)
+    done("probe", "run", "--baseline", "vlm", "--questions", 7)
+    done("merge", "run", "--method", "linear", "--strength", 0.5, "--out", "merged")
+    said = done("insert", "merged", "--into", source, "--out", "back")
+    assert "has not learned with it" in said
+    merged = backbones.load("merged").state_dict()
+    old, new = load_file(source / WEIGHTS), load_file("back" / Path(WEIGHTS))
+    prefix = FORMS["smolvla"].prefix
+    for name, tensor in new.items():
+        inside = name.startswith(prefix)
+        wanted = merged[f"vlm.{name.removeprefix(prefix)}"] if inside else old[name]
+        assert torch.equal(tensor, wanted), name
+    assert any(not torch.equal(new[name], old[name]) for name in new)
+    # The VLM by itself is no policy, and no recipe.
+    for command in (("export", "vlm", "--out", "x"), ("rollout", "vlm"), ("push", "vlm", "a/b")):
+        said = refused(aegis(*command))
+        assert "without an action expert" in said and "aegis insert vlm --into POLICY" in said
+        assert "--set backbone=vlm" in said
+    assert "--set backbone=vlm" in refused(aegis("train", "vlm"))
+
+
+# --- several VLMs ---------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def averaged(paligemma: Path, tmp_path: Path) -> tuple[Path, dict[str, dict[str, Tensor]]]:
+    """A policy with the average of its weights beside them, and the VLM's tensors of both."""
+    vlms = {"": foreign.moved(paligemma), "ema.": foreign.moved(paligemma, seed=1)}
+    form = FORMS["pi0 of openpi"]
+    found: dict[str, Tensor] = {}
+    for before, vlm in vlms.items():
+        found |= {before + name: t for name, t in foreign.tensors(vlm, form).items()}
+    return foreign.write(tmp_path / "policy", found, form), vlms
+
+
+@pytest.mark.parametrize("command", ["extract", "insert"])
+def test_the_command_that_is_named_for_two_vlms_takes_one(
+    command: str,
+    averaged: tuple[Path, dict[str, dict[str, Tensor]]],
+    paligemma: Path,
+    tmp_path: Path,
+    aegis: Aegis,
+) -> None:
+    source, _ = averaged
+    words = {
+        "extract": ("extract", source, "--base", paligemma, "--dtype", "bfloat16"),
+        "insert": ("insert", paligemma, "--into", source),
+    }
+    said = refused(aegis(*words[command], "--out", tmp_path / "out"))
+    assert "2 VLMs in" in said and "'ema.paligemma_with_expert.paligemma.'" in said
+    named = shlex.split(said.rpartition("choose it: ")[2].splitlines()[0])
+    assert named[-2:] == ["--prefix", "paligemma_with_expert.paligemma"]
+    code, _, _ = aegis(*named[1:])
+    assert code == 0 and (tmp_path / "out" / WEIGHTS).is_file()
+
+
+@pytest.mark.parametrize("prefix", ["ema", "paligemma_with_expert"])
+def test_one_of_two_vlms_is_taken_and_put_back_alone(
+    prefix: str,
+    averaged: tuple[Path, dict[str, dict[str, Tensor]]],
+    paligemma: Path,
+    tmp_path: Path,
+) -> None:
+    source, vlms = averaged
+    before = "ema." if prefix == "ema" else ""
+    report = take(source, paligemma, tmp_path / "vlm", prefix=prefix)
+    assert equal(load_file(tmp_path / "vlm" / WEIGHTS), vlms[before])
+    again = take(source, paligemma, tmp_path / "again", prefix=report.prefix)
+    assert again.taken == report.taken == len(vlms[before])
+    said: list[Event] = []
+    back = insert.run(str(paligemma), str(source), tmp_path / "back", said.append, prefix)
+    assert back.changed == report.taken
+    assert any("another VLM" in text and "stays as it was" in text for text in warnings(said))
+    old, new = load_file(source / WEIGHTS), load_file(tmp_path / "back" / WEIGHTS)
+    other = "" if prefix == "ema" else "ema."
+    own = FORMS["pi0 of openpi"].prefix
+    stay = [n for n in old if n.startswith(other + own) or "paligemma." not in n]
+    assert all(torch.equal(old[name], new[name]) for name in stay)
 
 
 # --- refused --------------------------------------------------------------------------------------
@@ -753,6 +896,42 @@ def test_other_commands_say_how_a_foreign_policy_is_measured(
     weights = load_file(lerobot / WEIGHTS)
     assert (report["kind"], report["facts"]["type"]) == ("lerobot-policy", "smolvla")
     assert report["facts"]["parameters"] == sum(tensor.numel() for tensor in weights.values())
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_file_of_weights_is_inspected_as_what_it_likely_is(
+    form: str, hf_folder: Folder, tmp_path: Path, aegis: Aegis
+) -> None:
+    base = base_of(form, hf_folder)
+    source = policy(tmp_path / "policy", foreign.moved(base), form)
+    (source / "config.json").unlink(missing_ok=True)
+
+    def inspected(path: Path) -> dict[str, Any]:
+        code, said, _ = aegis("inspect", path, "--json")
+        report = json.loads(said)
+        assert (code, report["kind"]) == (0, "safetensors")
+        weights = load_file(path)
+        facts: dict[str, Any] = report["facts"]
+        assert {tensor["name"] for tensor in report["tensors"]} == weights.keys()
+        assert sum(facts["types"].values()) == len(weights)
+        assert facts["parameters"] == sum(tensor.numel() for tensor in weights.values())
+        return facts
+
+    found = inspected(source / WEIGHTS)
+    assert found["likely"] == "a robot policy with a VLM"
+    assert f"aegis extract {source / WEIGHTS} --base VLM" in found["vlm"]
+    # The advice holds.
+    take(source / WEIGHTS, base, tmp_path / "vlm")
+    found = inspected(base / WEIGHTS)
+    assert found["likely"] == "a vision-language model" and str(base) in found["folder"]
+    assert "likely" not in inspected(source / SCALES)
+    _, said, _ = aegis("inspect", source / WEIGHTS)
+    assert "another program" in said and "F32" in said
+
+
+def test_nothing_of_another_program_is_verified(paligemma: Path, aegis: Aegis) -> None:
+    said = refused(aegis("inspect", paligemma / WEIGHTS, "--verify"))
+    assert "another program wrote" in said and "leave out --verify" in said
 
 
 def test_the_weights_have_the_header_of_the_bases(smolvlm: Path, tmp_path: Path) -> None:

@@ -11,10 +11,10 @@ from samples import foreign
 
 from aegis_cli.common.errors import AegisError
 from aegis_cli.publishing import vlm_names
-from aegis_cli.publishing.vlm_names import Spec
+from aegis_cli.publishing.vlm_names import Asked, Spec
 
 WORDS, WIDTH, DEPTH = 40, 16, 4
-CALLED = ("policy", "base")
+COMMAND = ("extract", "policy", "--base", "base")
 PARTS = st.sampled_from(["model", "policy", "vlm", "vlm_with_expert", "paligemma", "net", "core"])
 PREFIXES = st.lists(PARTS, max_size=4).map(lambda parts: "".join(f"{part}." for part in parts))
 SIZES = {
@@ -64,8 +64,13 @@ def policy(
     return {**beside, **named, f"{prefix}action_in_proj.weight": Spec((3, 8), "F32")}
 
 
-def found(own: Mapping[str, Spec], other: Mapping[str, Spec], tied: bool = True) -> vlm_names.Match:
-    return vlm_names.match(own, other, tied, CALLED)
+def found(
+    own: Mapping[str, Spec],
+    other: Mapping[str, Spec],
+    tied: bool = True,
+    prefix: str | None = None,
+) -> vlm_names.Match:
+    return vlm_names.match(own, other, tied, Asked("policy", "base", prefix, COMMAND))
 
 
 @given(PREFIXES, st.sampled_from(sorted(GENERATIONS)), st.sampled_from([0.5, 1.0]))
@@ -247,11 +252,58 @@ def test_whole_numbers_of_another_type_are_refused() -> None:
         found(own, policy(other, "model.", "modules"))
 
 
-def test_two_copies_of_the_vlm_are_refused() -> None:
-    own = base()
-    other = policy(own, "net.", "modules") | policy(own, "ema.", "modules")
-    with pytest.raises(AegisError, match=r"2 VLMs in 'policy' .* 'net\.', 'ema\.'"):
+def with_average(generation: str, prefixes: tuple[str, str] = ("net.", "ema.")) -> dict[str, Spec]:
+    one, other = prefixes
+    return policy(base(), one, generation) | policy(base(), other, generation)
+
+
+def test_two_copies_of_the_vlm_are_refused_with_a_command_for_one() -> None:
+    with pytest.raises(AegisError, match=r"2 VLMs in 'policy' .* 'net\.', 'ema\.'") as caught:
+        found(base(), with_average("modules"))
+    assert "aegis extract policy --base base --prefix net" in caught.value.fix
+
+
+@pytest.mark.parametrize("generation", sorted(GENERATIONS))
+@pytest.mark.parametrize("given", ["ema", "ema.", "e", "{}"])
+def test_a_prefix_chooses_one_of_two_copies(generation: str, given: str) -> None:
+    own, other = base(), with_average(generation)
+    alone = found(own, policy(own, "ema.", generation))
+    if given == "e":  # no part of a name
+        with pytest.raises(AegisError, match=r"no VLM under --prefix 'e' .* 'net\.', 'ema\.'"):
+            found(own, other, prefix=given)
+        return
+    # The report names a longer one where a part that keys ignore is common to all names.
+    match = found(own, other, prefix=given.format(alone.prefix))
+    assert match.taken == alone.taken and match.more == alone.more
+    assert match.others == ("net.",) and alone.others == ()
+
+
+@pytest.mark.parametrize("generation", sorted(GENERATIONS))
+def test_a_copy_at_the_root_is_chosen_by_no_prefix(generation: str) -> None:
+    own, other = base(), with_average(generation, ("", "ema."))
+    with pytest.raises(AegisError, match=r"under '' \(no prefix\), 'ema\.'") as caught:
         found(own, other)
+    assert caught.value.fix.endswith("--prefix ''")
+    alone = found(own, policy(own, "", generation))
+    for chosen, prefix in (("", ""), ("ema", "ema.")):
+        match = found(own, other, prefix=chosen)
+        assert match.taken == {name: prefix + taken for name, taken in alone.taken.items()}
+        assert not any(name.startswith("ema.") for name in match.more if not prefix)
+
+
+def test_the_beginning_of_several_prefixes_chooses_none() -> None:
+    other = with_average("modules", ("a.net.", "a.ema."))
+    with pytest.raises(AegisError, match="2 VLMs under --prefix 'a'"):
+        found(base(), other, prefix="a")
+    assert found(base(), other, prefix="a.ema").taken
+
+
+def test_a_prefix_may_be_given_where_there_is_one_vlm() -> None:
+    own = base()
+    other = policy(own, "model.vlm.", "modules")
+    assert found(own, other, prefix="model") == found(own, other)
+    with pytest.raises(AegisError, match=r"no VLM under --prefix 'ema' .* under 'model\.vlm\.'"):
+        found(own, other, prefix="ema")
 
 
 def test_of_two_vlms_the_one_of_the_bases_shapes_is_taken() -> None:

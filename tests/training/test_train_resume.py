@@ -412,7 +412,8 @@ def test_a_run_goes_on_with_its_own_backbone_only(
     start("naive", tmp_path / "run", recipe=ours, anchor=None)
     make_tiny(1).save(tmp_path / "vlm")
     refused(
-        "a different backbone",
+        f"a different backbone than the run in '{tmp_path / 'run'}' began with: "
+        f"'{tmp_path / 'vlm'}' has changed since",
         start,
         "naive",
         tmp_path / "run",
