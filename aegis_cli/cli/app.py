@@ -912,20 +912,30 @@ def compare(
             help="Folders of runs; a job's, or any other with runs in it, stands for all of them.",
         ),
     ],
+    against: Annotated[
+        str | None,
+        Option(
+            metavar="RUN",
+            help="Run that paired differences are from: its folder, or its method; default: the "
+            "first run, or the naive one of a first folder of several.",
+        ),
+    ] = None,
     wide: Wide = False,
     as_json: Json = False,
 ) -> None:
     """Compare runs in one table: what each keeps of VQA, how it acts, and what it costs.
 
     Shown is what `aegis run`, `aegis probe`, `aegis rollout` and `aegis evaluate` have measured of
-    each.
+    each. A second table has each run's differences from one of them, on the same questions and
+    episodes, with 95 % intervals.
 
     \b
     Example: aegis compare runs/x runs/y
     Example: aegis compare runs
+    Example: aegis compare runs/quickstart --against lora
     Example: aegis compare runs/quickstart runs/x --json
     """
-    stages.COMPARE.run(paths, wide=wide, as_json=as_json)
+    stages.COMPARE.run(paths, against=against, wide=wide, as_json=as_json)
 
 
 @app.command(short_help="Compare two models' scores on standard benchmarks.")
@@ -977,18 +987,22 @@ def scores(
     _gate(failed)
 
 
-@app.command(short_help="Write a run, job or study as one HTML page.")
+@app.command(short_help="Write runs, a job or a study as one HTML page.")
 def report(
-    path: Annotated[
-        Path,
+    paths: Annotated[
+        list[Path],
         Argument(
-            metavar="PATH",
-            help="The folder of a run or stream, or one that aegis run wrote: a job or study.",
+            metavar="PATH ...",
+            help="The folder of a run or stream, or one that aegis run wrote: a job or study; or "
+            "several folders of runs, for one page that compares them.",
         ),
     ],
     out: Annotated[
         Path | None,
-        Option(metavar="FILE", help="Page to write, ending in .html; default: PATH/report.html."),
+        Option(
+            metavar="FILE",
+            help="Page to write, ending in .html; default: PATH/report.html, and none for several.",
+        ),
     ] = None,
     as_json: Json = False,
 ) -> None:
@@ -996,13 +1010,14 @@ def report(
 
     The page shows what was trained on what, learning curves, drift per layer, the energy shed, VQA
     by family with wrong answers, success with intervals, videos, a study's frontier, the commands
-    that repeat it, and the machine. Its figures are those of --json.
+    that repeat it, and the machine. Several runs are side by side, with paired differences. Its
+    figures are those of --json.
 
     \b
     Example: aegis report runs/quickstart
-    Example: aegis report runs/x --out x.html
+    Example: aegis report runs/x runs/y --out compared.html
     """
-    reporting.write(path, out, as_json)
+    reporting.write(paths, out, as_json)
 
 
 @app.command(short_help="Let a trained policy act, and count its successes.")

@@ -16,6 +16,7 @@ from aegis_cli.common import files
 from aegis_cli.common.errors import AegisError
 
 Number = Annotated[float, Field(allow_inf_nan=False)]  # an integer of 400 digits is infinite
+Small = Annotated[int, Field(gt=-(2**31), lt=2**31)]  # so that a damaged file fills no memory
 Interval = tuple[Number, Number] | None
 
 
@@ -71,6 +72,10 @@ class ProbeFigures:
     baseline_soft_accuracy: Number | None = None
     skipped: int = 0
     w2_between: str | None = None
+    correct_per_image: list[Small] | None = None
+    lost_per_image: list[Small] | None = None
+    questions_per_image: list[Annotated[Small, Field(ge=1)]] | None = None
+    images: list[str] | None = None
     wrong: list[WrongAnswer] | None = None
     settings: dict[str, Any] | None = None
     step: int | None = None
@@ -105,7 +110,7 @@ class RolloutFigures:
     colors: str | None = None
     success: Number | None = None
     interval: Interval = None
-    outcomes: str | None = None
+    outcomes: Annotated[str, Field(pattern="^[01]*$")] | None = None
     wrong_target: Number | None = None
     final_distance_m: Number | None = None
     suites: dict[str, PartFigures] | None = None
@@ -140,7 +145,7 @@ class EpisodeFigures:
 
     episode: int
     frames: int
-    steps: int
+    steps: Annotated[Small, Field(ge=1)]
     relative_error: Number | None = None
     hold_error: Number | None = None
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import collections
 import math
 import shlex
 from collections.abc import Sequence
@@ -171,7 +172,7 @@ def run(
     if keep and ranks.first:
         wrong = {"wrong": wrong_answers.examples(after, asked, model.image_size)}
         name = f"probe-{source.name}"
-        figures = report.to_json() | wrong
+        figures = report.to_json() | by_image(after, reference, asked.names) | wrong
         del figures["asked"]  # the settings contain it
         settings |= _path_of(vqa)
         results.keep_if_possible(Path(target), name, figures, settings, on_event)
@@ -468,29 +469,29 @@ def compare(
 
 
 def by_image(
-    after: Sequence[Graded], before: Sequence[Graded], names: Sequence[str] | None
+    after: Sequence[Graded], before: Sequence[Graded] | None, names: Sequence[str] | None
 ) -> dict[str, Any]:
-    """What was lost on each image, from which intervals over images are computed.
+    """The answers about each image, from which intervals over images are computed.
 
-    `lost_per_image` is the number of correct answers before minus that after, out of
-    `questions_per_image`; images are in the order of their numbers in the set.
+    `correct_per_image` counts the correct answers and `lost_per_image` those before minus those
+    after, out of `questions_per_image`; images are in the order of their numbers in the set.
 
     Args:
+        before: None leaves out what was lost.
         names: names of the set's images, which identify equal images of other sets (`images`);
             None: no other set shares them.
     """
     # By image, since its questions share its difficulty: the crossed bootstrap draws whole images.
-    lost: dict[int, int] = {}
-    questions: dict[int, int] = {}
-    for now, then in zip(after, before, strict=True):
-        lost[now.image] = lost.get(now.image, 0) + int(then.correct) - int(now.correct)
-        questions[now.image] = questions.get(now.image, 0) + 1
+    questions = collections.Counter(graded.image for graded in after)
+    correct = collections.Counter(graded.image for graded in after if graded.correct)
     numbers = sorted(questions)
-    return {
-        "lost_per_image": [lost[number] for number in numbers],
-        "questions_per_image": [questions[number] for number in numbers],
-        "images": None if names is None else [names[number] for number in numbers],
-    }
+    found: dict[str, Any] = {"correct_per_image": [correct[number] for number in numbers]}
+    if before is not None:
+        known = collections.Counter(graded.image for graded in before if graded.correct)
+        found["lost_per_image"] = [known[number] - correct[number] for number in numbers]
+    found["questions_per_image"] = [questions[number] for number in numbers]
+    found["images"] = None if names is None else [names[number] for number in numbers]
+    return found
 
 
 def check_trained(report: ProbeReport, steps: int) -> None:

@@ -16,7 +16,9 @@ from aegis_cli.common.events import OnEvent, Warned, ignore
 from aegis_cli.data.episodes import as_text
 from aegis_cli.evaluation import results
 from aegis_cli.inspection import InspectReport
-from aegis_cli.reporting import differences
+from aegis_cli.recipes.study_cells import NAIVE
+from aegis_cli.reporting import differences, paired
+from aegis_cli.reporting.paired import PairedRun
 from aegis_cli.studies import table
 from aegis_cli.studies.cells import CELLS
 from aegis_cli.studies.pipeline import PipelineReport
@@ -25,6 +27,7 @@ from aegis_cli.training.up_to_date import refuse_unfinished
 
 Interval = tuple[float, float] | None
 _Named = tuple[Any, results.Result]  # a result and the name by which runs are matched
+Inspected = tuple[Path, InspectReport]
 _FRAMES = ("episodes", "trained_on", "frames", "seed")  # figures that identify the frames
 _MOST = 60  # characters of a list of episodes in a warning
 
@@ -72,13 +75,16 @@ class Comparison:
 
     `same_open_loop` says whether all open-loop errors are of the same frames, `same_episodes`
     whether all rollouts on the same colours played the same episodes. `differs` has the settings
-    other than the method in which the runs differ, with each run's value.
+    other than the method in which the runs differ, with each run's value. `paired` has every other
+    run's differences from the run `against`, which is None for a single run.
     """
 
     rows: list[ComparedRun]
     same_open_loop: bool = True
     same_episodes: bool = True
     differs: dict[str, list[differences.Value]] = field(default_factory=dict)
+    against: str | None = None
+    paired: list[PairedRun] = field(default_factory=list)
 
     @property
     def same_validation(self) -> bool:
@@ -99,34 +105,95 @@ class Comparison:
         return dataclasses.asdict(self)
 
 
-def run(paths: Sequence[Path], on_event: OnEvent = ignore) -> Comparison:
+def run(
+    paths: Sequence[Path], on_event: OnEvent = ignore, against: str | None = None
+) -> Comparison:
     """Read the measurements of each run.
+
+    Args:
+        against: the run that the others' paired differences are from: its folder, or a method that
+            only one of them has. By default it is the first one; of a folder of several runs, its
+            `naive`, if there is one.
+
+    Raises:
+        AegisError: a path is not a run of a policy, nor a folder with such runs; or `against` is
+            none of these runs.
+    """
+    first, *others = (runs_in(Path(given), on_event) for given in paths)
+    found = first + [one for several in others for one in several]
+    reference = first_naive(first) if against is None else _named(against, found)
+    return of(found, reference, on_event)
+
+
+def runs_in(path: Path, on_event: OnEvent) -> list[Inspected]:
+    """The run at a path, or all runs in a folder.
+
+    Raises:
+        AegisError: there is no run of a policy.
+    """
+    return [(run, inspected(run)) for run in _runs(path, on_event)]
+
+
+def first_naive(found: Sequence[Inspected]) -> int:
+    """The number of the first naive run, with which all methods are compared; 0 without one."""
+    naive = (i for i, (_, one) in enumerate(found) if one.facts["method"] == NAIVE)
+    return next(naive, 0)
+
+
+def of(found: Sequence[Inspected], reference: int, on_event: OnEvent = ignore) -> Comparison:
+    """Compare runs.
 
     The first question set that every run was probed on is compared. If there is none, each run's
     own first set is shown, with a warning. Open-loop evaluations are compared likewise if they have
     the same episodes, frames and seed, whether the episodes were trained on or not.
 
-    Raises:
-        AegisError: a path is not a run of a policy, nor a folder with such runs.
+    Args:
+        reference: the number of the run that paired differences are from.
     """
-    found = []
-    for given in paths:  # a run, or a folder with several
-        found += [(path, _inspected(path)) for path in _runs(Path(given), on_event)]
     # The compared results are chosen over all runs together.
     probed = _one_of_each([_by_set(path, one) for path, one in found])
     evaluated = _one_of_each([_by_episodes(path, one) for path, one in found])
     rows = [_compared(*each, *own) for each, *own in zip(found, probed, evaluated, strict=True)]
     _warn_of_unfinished(found, on_event)
     _warn_of_merges(found, on_event)
+    played = [_by_colors(one) for _, one in found]
     facts = [
-        differences.of_run(path, row.steps, asked, _by_colors(one))
-        for (path, one), row, asked in zip(found, rows, probed, strict=True)
+        differences.of_run(path, row.steps, asked, own)
+        for (path, _), row, asked, own in zip(found, rows, probed, played, strict=True)
     ]
     same_frames = len({own[0] for own in evaluated if own is not None}) < 2
-    same_episodes = _same_episodes([_by_colors(one) for _, one in found])
-    made = Comparison(rows, same_frames, same_episodes, differences.between(facts))
+    made = Comparison(rows, same_frames, _same_episodes(played), differences.between(facts))
+    if len(rows) > 1:
+        measured = []
+        for i, row in enumerate(rows):
+            asked = probed[i]
+            told = None if asked is None else (facts[i]["questions"], asked[1])
+            measured.append(paired.Measured(row.run, row.method, told, played[i], evaluated[i]))
+        first = measured.pop(reference)
+        pairs = [paired.between(first, other) for other in measured]
+        made = dataclasses.replace(made, against=first.run, paired=pairs)
     _warn_of_differences(made, evaluated, on_event)
     return made
+
+
+def _named(against: str, found: Sequence[Inspected]) -> int:
+    """The number of the run with this folder, or the only one with this method.
+
+    Raises:
+        AegisError: there is none, or several have the method.
+    """
+    place = Path(against).resolve()
+    known = [i for i, (path, _) in enumerate(found) if path.resolve() == place]
+    if known:
+        return known[0]
+    known = [i for i, (_, one) in enumerate(found) if against in (one.method, one.facts["method"])]
+    if len(known) == 1:
+        return known[0]
+    listed = ", ".join(str(found[i][0]) for i in known or range(len(found)))
+    what = f"the method of {len(known)} runs" if known else "none of the compared runs"
+    expected = f"one of {listed}"
+    fix = "give the folder of one of them" + ("" if known else ", or compare that run too")
+    raise AegisError(f"--against {against}, which is {what}", expected, fix)
 
 
 def _warn_of_differences(
@@ -199,7 +266,7 @@ def _warn_of_merges(found: Sequence[tuple[Path, InspectReport]], on_event: OnEve
             on_event(Warned("compare", f"{text}; what was merged and measured is in '{merged}'"))
 
 
-def _inspected(path: Path) -> InspectReport:
+def inspected(path: Path) -> InspectReport:
     found = inspection.run(path)
     assert isinstance(found, InspectReport)  # a stream's run is refused before
     return found
@@ -235,8 +302,7 @@ def _same_episodes(each: Sequence[Mapping[str | None, results.PlayedResult]]) ->
     known = dict[str | None, tuple[Any, ...]]()
     for rollouts in each:
         for colors, one in rollouts.items():
-            episodes = one.figures.get("task"), one.figures["episodes"], one.played.seed
-            if known.setdefault(colors, episodes) != episodes:
+            if known.setdefault(colors, paired.episodes_of(one)) != paired.episodes_of(one):
                 return False
     return True
 
@@ -274,7 +340,7 @@ def _runs(path: Path, on_event: OnEvent) -> list[Path]:
         return [path]
     elif not (path / CELLS).is_file():  # a study's folder has no table of runs
         refuse_unfinished(path, "compare")
-        if inside := _runs_inside(path, on_event):
+        if inside := runs_inside(path, on_event):
             return inside
     expected = (
         "folders that aegis train wrote, one that aegis run made of a recipe, or one with runs in "
@@ -294,7 +360,7 @@ def _is_run(path: Path) -> bool:
     return (path / "recipe.yaml").is_file() and not recipes.is_stream_run(path)
 
 
-def _runs_inside(folder: Path, on_event: OnEvent) -> list[Path]:
+def runs_inside(folder: Path, on_event: OnEvent) -> list[Path]:
     """The runs directly in a folder that have a checkpoint, sorted by name."""
     runs: list[Path] = []
     for saved in sorted(folder.glob("*/recipe.yaml")):

@@ -1,4 +1,4 @@
-"""`aegis report`: the contents of a run's, job's or study's folder as one document.
+"""`aegis report`: the contents of a run's, job's or study's folder, or of several, as a document.
 
 A job is the result of `aegis run` on a recipe with several methods. Nothing is measured here: all
 figures were written by the stages.
@@ -7,6 +7,7 @@ figures were written by the stages.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +19,8 @@ from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, ignore
 from aegis_cli.evaluation import kept_figures, results
 from aegis_cli.recipes.study_cells import written_out
+from aegis_cli.reporting import compare
+from aegis_cli.reporting.paired import PairedRun
 from aegis_cli.studies import table
 from aegis_cli.studies.cells import CELLS
 from aegis_cli.studies.comparison import (
@@ -104,13 +107,33 @@ class RunDocument:
 
 @dataclass(frozen=True)
 class JobDocument:
-    """All methods of one recipe, and the table that compares them."""
+    """All methods of one recipe, and the table that compares them.
+
+    Attributes:
+        against, paired: as in a `Comparison` of its runs.
+    """
 
     kind: str
     path: str
     table: PipelineReport
     runs: list[RunDocument]
     videos: list[Video]
+    commands: list[str]
+    against: str | None
+    paired: list[PairedRun]
+
+    def to_json(self) -> dict[str, Any]:
+        return dataclasses.asdict(self)
+
+
+@dataclass(frozen=True)
+class ComparisonDocument:
+    """Several runs, and what `aegis compare` shows of them; `path` lists the given folders."""
+
+    kind: str
+    path: str
+    comparison: compare.Comparison
+    runs: list[RunDocument]
     commands: list[str]
 
     def to_json(self) -> dict[str, Any]:
@@ -149,15 +172,15 @@ _STUDIES: dict[type, str] = {
     RobotStreamStudyReport: "robot-stream-study",
 }
 
-Document = RunDocument | JobDocument | StudyDocument | StreamDocument
+Document = RunDocument | JobDocument | ComparisonDocument | StudyDocument | StreamDocument
 
 
 def run(path: Path, on_event: OnEvent = ignore) -> Document:
-    """The document of a folder; `on_event`, which every stage has, is never called.
+    """The document of a folder.
 
     Raises:
-        AegisError: the folder was not written by `aegis train` or `aegis run`, or a file is
-            damaged.
+        AegisError: the folder was not written by `aegis train` or `aegis run` and has no run in it,
+            or a file is damaged.
     """
     path = Path(path)
     # A table first: a study that has just started has only cells, which `table.load` reports.
@@ -168,17 +191,49 @@ def run(path: Path, on_event: OnEvent = ignore) -> Document:
         assert isinstance(found, inspection.StreamInspection)
         repeat = commands.aegis("train", path / "recipe.yaml", "--out", "NEW_FOLDER")
         return StreamDocument(found.kind, str(path), found.report, [repeat])
-    if not (path / "recipe.yaml").is_file():
-        refuse_unfinished(path, "report")
-        inside = sorted(p.parent for p in path.glob(f"*/{table.NAME}"))
-        inside += sorted(p.parent for p in path.glob("*/recipe.yaml"))
-        example = next(iter(inside), "runs/quickstart")
-        expected = "a folder that aegis train or aegis run wrote"
-        if not path.exists():
-            raise AegisError(f"nothing is at '{path}'", expected, "check the path")
-        fix = commands.aegis("report", example)
-        raise AegisError(f"'{path}' is not a run, job or study", expected, fix)
-    return run_document(path, videos=True)
+    if (path / "recipe.yaml").is_file():
+        return run_document(path, videos=True)
+    refuse_unfinished(path, "report")
+    if compare.runs_inside(path, ignore):
+        return of_runs([path], on_event)
+    inside = sorted(p.parent for p in path.glob(f"*/{table.NAME}"))
+    inside += sorted(p.parent for p in path.glob("*/recipe.yaml"))
+    example = next(iter(inside), "runs/quickstart")
+    expected = "a folder that aegis train or aegis run wrote, or one with runs in it"
+    if not path.exists():
+        raise AegisError(f"nothing is at '{path}'", expected, "check the path")
+    fix = commands.aegis("report", example)
+    raise AegisError(f"'{path}' is not a run, job or study", expected, fix)
+
+
+def of_runs(paths: Sequence[Path], on_event: OnEvent = ignore) -> ComparisonDocument:
+    """The document of several runs; one that is named twice is in it once.
+
+    Raises:
+        AegisError: a path is not a run of a policy, nor a folder with such runs, or a file is
+            damaged.
+    """
+    first, *others = (compare.runs_in(Path(given), on_event) for given in paths)
+    by_place: dict[Path, compare.Inspected] = {}
+    for one in itertools.chain(first, *others):
+        by_place.setdefault(one[0].resolve(), one)
+    found = list(by_place.values())
+    reference = first[compare.first_naive(first)][0].resolve()
+    comparison = compare.of(found, list(by_place).index(reference), on_event)
+    runs = [run_document(path, videos=True, found=one) for path, one in found]
+    labels = zip(runs, _labels(runs), strict=True)
+    runs = [dataclasses.replace(one, label=label) for one, label in labels]
+    listed = ", ".join(map(str, paths))
+    again = commands.aegis("report", *paths, "--out", "PAGE.html")
+    return ComparisonDocument("comparison", listed, comparison, runs, [again])
+
+
+def _labels(runs: Sequence[RunDocument]) -> list[str]:
+    """A name for each run: its method, its folder's name or its path, whichever is its own."""
+    for names in ([one.label for one in runs], [Path(one.path).absolute().name for one in runs]):
+        if len(set(names)) == len(names):
+            return names
+    return [one.path for one in runs]
 
 
 def _of_table(path: Path) -> Document:
@@ -186,25 +241,38 @@ def _of_table(path: Path) -> Document:
     if not isinstance(found, PipelineReport):
         again = commands.aegis("run", "RECIPE", "--out", path.parent)
         return StudyDocument(_STUDIES[type(found)], str(path), found, [again])
-    runs = [run_document(run) for run in table.runs(found)]
+    inside = [(run, compare.inspected(run)) for run in table.runs(found)]
+    runs = [run_document(run, found=one) for run, one in inside]
+    compared = compare.of(inside, compare.first_naive(inside))
     # Each method's recipe names all methods of the job, and has every value that was set.
     recipe = path / found.rows[0].method / "recipe.yaml"
     again = commands.aegis("run", recipe, "--out", "NEW_FOLDER")
-    return JobDocument("job", str(path), found, runs, _videos(path), [again])
+    return JobDocument(
+        kind="job",
+        path=str(path),
+        table=found,
+        runs=runs,
+        videos=_videos(path),
+        commands=[again],
+        against=compared.against,
+        paired=compared.paired,
+    )
 
 
-def run_document(path: Path, videos: bool = False) -> RunDocument:
+def run_document(
+    path: Path, videos: bool = False, found: inspection.InspectReport | None = None
+) -> RunDocument:
     """The document of a run of one policy.
 
     Args:
-        videos: whether to list the videos in its folder, as in a report of a single run.
+        videos: whether to list the videos in its folder; a job lists those of all its runs.
+        found: what its inspection has found, if it has been inspected.
 
     Raises:
         AegisError: there is no checkpoint yet, or a file is damaged.
     """
     recipe = recipes.load(path / "recipe.yaml")
-    found = inspection.run(path)
-    assert isinstance(found, inspection.InspectReport)
+    found = compare.inspected(path) if found is None else found
     train = _jobs_report(path)
     about = path / machine.NAME
     anchor = _anchor(path, recipe, found)

@@ -97,6 +97,17 @@ def test_the_job_by_hand(
     assert rolled["episodes"] == 2 and picture("out.gif").std() > 5
     assert (tmp_path / "runs/x/results/rollout-reach-all.json").is_file()
     assert done("compare", "runs/x")["rows"][0]["accuracy"] == probed["accuracy"]
+    done("train", settings, "--method", "naive", "--demos", "reach.safetensors", "--out", "runs/y")
+    asked = done("probe", "runs/y", "--questions", 14)  # without a baseline
+    done("rollout", "runs/y", "--task", "reach", "--episodes", 2, "--colors", "seen")
+    done("rollout", "runs/x", "--task", "reach", "--episodes", 2, "--colors", "seen")
+    (other,) = done("compare", "runs/x", "runs/y")["paired"]
+    gained = 100 * (asked["accuracy"] - probed["accuracy"])
+    assert other["vqa_points"]["mean"] == pytest.approx(gained)
+    assert other["success_seen_points"]["interval"] and other["success_held_out_points"] is None
+    both = done("report", "runs/x", "runs/y", "--out", "both.html")
+    assert [run["path"] for run in both["runs"]] == ["runs/x", "runs/y"]
+    assert both["comparison"]["paired"] == [other]
     assert done("report", "runs/x")["rollouts"][0]["figures"]["episodes"] == 2
     assert "data:image/png;base64," in (tmp_path / "runs/x/report.html").read_text()
     assert not list(tmp_path.rglob("*.tmp")) and not list(tmp_path.rglob(".*"))

@@ -350,6 +350,120 @@ def test_what_an_older_version_did_not_write_is_left_out(aegis, job: Path, missi
     assert aegis("compare", job)[0] == 0
 
 
+# --- several runs ---------------------------------------------------------------------------------
+
+
+def compared(aegis: Any, *runs: Path) -> tuple[Page, Any]:
+    """The page of several runs, and the output of `--json` when it was written."""
+    out = runs[0].parent / "compared.html"
+    code, said, err = aegis("report", *runs, "--out", out, "--json")
+    assert code == 0, err
+    return Page(out.read_text(encoding="utf-8")), json.loads(said)
+
+
+def played(run: Path, outcomes: str) -> None:
+    path = run / "rollout-seen.json"
+    found = files.load_json(path) | {"outcomes": outcomes, "episodes": len(outcomes)}
+    files.save_json(path, found)
+
+
+def test_several_runs_have_one_page_with_what_compares_them_and_a_part_of_each(
+    aegis, job: Path
+) -> None:
+    played(job / "naive", "0" * 30)
+    played(job / "aegis", "1" * 30)
+    page, document = compared(aegis, job / "naive", job / "aegis")
+    check_figures(page, document)
+    assert document["kind"] == "comparison"
+    assert [run["label"] for run in document["runs"]] == ["naive", "aegis"]
+    shown = {path for path, _, _ in page.figures}
+    assert {
+        "/comparison/rows/1/drop_points",
+        "/comparison/rows/0/baseline_accuracy",
+        "/comparison/paired/0/success_seen_points/mean",
+        "/comparison/paired/0/success_seen_points/interval/1",
+        "/runs/1/probes/0/figures/drop_points",
+        "/runs/0/probes/0/figures/layers/1/w2",
+    } <= shown
+    assert "Runs compared" in page.said and "Differences from naive" in page.said
+    for run in (job / "naive", job / "aegis"):
+        assert f"{run}: Method {run.name} fine-tuned embedded" in page.said
+    assert page.said.count("How to repeat it") == page.said.count("Every key of its recipe") == 2
+    assert "VQA accuracy lost (points)" in page.said  # the axis of the chart of both
+    assert sum(tag == "svg" for tag, _ in page.tags) >= 3  # the chart, curves, drift
+
+
+def test_a_folder_of_runs_has_a_page_in_it(aegis, job: Path) -> None:
+    for name, method in (("a", "aegis"), ("b", "naive")):
+        shutil.copytree(job / method, job.parent / "runs" / name, symlinks=True)
+    (job.parent / "runs" / "aa").symlink_to("a")  # the same run, which is on the page once
+    page, document = reported(aegis, job.parent / "runs")
+    check_figures(page, document)
+    assert [run["label"] for run in document["runs"]] == ["aegis", "naive"]
+    assert document["comparison"]["against"] == str(job.parent / "runs" / "b")
+
+
+def test_runs_of_one_method_have_their_folders_names(aegis, job: Path) -> None:
+    shutil.copytree(job / "naive", job / "again", symlinks=True)
+    shutil.copytree(job / "naive", job / "deep" / "again", symlinks=True)
+    page, document = compared(aegis, job / "naive", job / "again", job / "naive")
+    check_figures(page, document)
+    assert [run["label"] for run in document["runs"]] == ["naive", "again"]
+    _, document = compared(aegis, job / "again", job / "deep" / "again")
+    assert [run["label"] for run in document["runs"]] == [run["path"] for run in document["runs"]]
+
+
+def test_several_folders_have_no_page_without_out(aegis, job: Path) -> None:
+    said = refused(aegis("report", job / "naive", job / "aegis"))
+    assert "2 folders without --out" in said
+    assert f"aegis report {job / 'naive'} {job / 'aegis'} --out compared.html" in said
+    assert not list(job.rglob("*.html"))
+
+
+def test_what_is_no_run_is_not_compared_on_a_page(aegis, job: Path, tmp_path: Path) -> None:
+    (tmp_path / "study").mkdir()
+    files.save_json(tmp_path / "study" / "table.json", found(("naive", "x")).to_json())
+    said = refused(aegis("report", job, tmp_path / "study", "--out", tmp_path / "x.html"))
+    assert "is not the run of a policy" in said
+
+
+def test_runs_that_were_asked_otherwise_are_apart_on_their_page(aegis, job: Path) -> None:
+    """Neither in one chart nor in one table of families, whose column of before is of one model."""
+    path = job / "aegis" / "probe.json"
+    files.save_json(path, files.load_json(path) | {"baseline_accuracy": 0.5, "questions": 41})
+    page, document = compared(aegis, job / "naive", job / "aegis")
+    check_figures(page, document)
+    assert "They differ in questions (40 of scenes; 41 of scenes)" in page.said
+    assert "VQA accuracy lost (points)" not in page.said
+    files.save_json(path, files.load_json(path) | {"questions": 40})
+    page, _ = compared(aegis, job / "naive", job / "aegis")
+    assert page.said.count("VQA by family of questions: scenes, 40 questions") == 2
+
+
+def test_backbones_of_other_depths_have_a_row_each(aegis, job: Path) -> None:
+    path = job / "aegis" / "probe.json"
+    probed = files.load_json(path)
+    layers = [*probed["layers"], {"layer": "layers.2", "w2": 3.0}]
+    files.save_json(path, probed | {"layers": layers})
+    page, document = compared(aegis, job / "naive", job / "aegis")
+    check_figures(page, document)
+    assert "layers.2" in page.said
+
+
+def test_the_page_of_a_job_has_paired_differences_from_naive(aegis, job: Path) -> None:
+    played(job / "naive", "0" * 30)
+    played(job / "aegis", "1" * 30)
+    page, document = reported(aegis, job)
+    check_figures(page, document)
+    assert document["against"] == str(job / "naive")
+    shown = {path: text for path, _, text in page.figures}
+    assert shown["/paired/0/success_seen_points/mean"] == "+100.0"
+    assert "/paired/0/success_held_out_points/interval/0" in shown
+    text = (job / "report.html").read_text(encoding="utf-8")
+    assert re.search(r"<strong><data [^>]*>\+100.0</data></strong>", text)
+    assert "Another seed may differ by more" in page.said
+
+
 def test_out_names_the_page(aegis, job: Path, tmp_path: Path) -> None:
     code, out, err = aegis("report", job, "--out", tmp_path / "x.html")
     assert (code, out) == (0, "") and "x.html" in err

@@ -19,7 +19,7 @@ _TYPES = {".mp4": "video/mp4", ".webm": "video/webm", ".gif": "image/gif"}
 _EMBEDDED_BYTES = 8_000_000  # of a video; larger ones are linked
 
 
-def videos(found: At, folder: Path, page: Path) -> Markup | None:
+def videos(found: At, folder: Path, page: Path, title: str = "Videos") -> Markup | None:
     """The videos of a folder; small ones are embedded in the page.
 
     Args:
@@ -27,7 +27,7 @@ def videos(found: At, folder: Path, page: Path) -> Markup | None:
     """
     if not found:
         return None
-    return section("Videos", *(_film(video, folder, page) for video in found))
+    return section(title, *(_film(video, folder, page) for video in found))
 
 
 def _film(video: At, folder: Path, page: Path) -> Markup:
@@ -49,8 +49,12 @@ def _film(video: At, folder: Path, page: Path) -> Markup:
 
 def commands(page: At) -> Markup:
     """The commands that reproduce the results."""
-    lines = "\n".join(str(line) for line in page["commands"])
-    return section("Repeat it", element("pre", element("code", lines)))
+    return section("Repeat it", command_lines(page))
+
+
+def command_lines(found: At) -> Markup:
+    lines = "\n".join(str(line) for line in found["commands"])
+    return element("pre", element("code", lines))
 
 
 def machine(runs: Sequence[At]) -> Markup:
@@ -72,7 +76,11 @@ def machine(runs: Sequence[At]) -> Markup:
     return section("Machine and versions", table(header, rows, left=1 + len(known)))
 
 
-def recipe(run: At, title: str = "Recipe") -> Markup:
+def recipe(run: At) -> Markup:
     """Every key of the recipe with its value, in a collapsed section."""
+    return section("Recipe", recipe_keys(run, "Every key"))
+
+
+def recipe_keys(run: At, summary: str) -> Markup:
     listed = element("pre", element("code", dump(run["recipe"].value)))
-    return section(title, element("details", element("summary", "Every key"), listed))
+    return element("details", element("summary", summary), listed)

@@ -11,7 +11,7 @@ from typing import Any
 from rich.console import RenderableType
 
 from aegis_cli.cli import render
-from aegis_cli.cli.page import about, charts, runs, studies
+from aegis_cli.cli.page import about, charts, paired, runs, studies
 from aegis_cli.cli.page.charts import HeatMap, Row, Spot
 from aegis_cli.cli.page.cursor import At, between, decimal, plain, share
 from aegis_cli.cli.page.html import Child, Markup, element, join
@@ -22,6 +22,7 @@ from aegis_cli.common import files
 from aegis_cli.common.version import __version__
 from aegis_cli.inspection import steps_taken
 from aegis_cli.recipes.policy import CONSTANT, COSINE
+from aegis_cli.reporting import differences
 from aegis_cli.studies.comparison import PolicyResult
 from aegis_cli.studies.metrics import columns
 
@@ -71,10 +72,8 @@ def _header(kind: str, title: str, lead: Child, *further: Child) -> Markup:
 
 def _run(found: At, report: Any, folder: Path) -> tuple[str, list[Child]]:
     title = f"{found['facts']['recipe']}: {found['label']}"
-    lead = f"Method {found['method']} fine-tuned {found['backbone']} on {_task(found)}, "
-    lead += f"{_steps(found)} steps, seed {found['facts']['seed']}."
     parts = [
-        _header("Run", title, lead, runs.at_a_glance(found)),
+        _header("Run", title, _lead(found), runs.at_a_glance(found)),
         _trained(found, _anchor([found])),
         *_measured([found]),
         about.videos(found["videos"], Path(report.path), folder),
@@ -83,6 +82,12 @@ def _run(found: At, report: Any, folder: Path) -> tuple[str, list[Child]]:
         about.recipe(found),
     ]
     return title, parts
+
+
+def _lead(run: At) -> str:
+    """What a run was trained on, in a sentence."""
+    said = f"Method {run['method']} fine-tuned {run['backbone']} on {_task(run)}, "
+    return said + f"{_steps(run)} steps, seed {run['facts']['seed']}."
 
 
 def _task(run: At) -> str:
@@ -194,7 +199,8 @@ def _job(found: At, report: Any, folder: Path) -> tuple[str, list[Child]]:
     parts = [
         _header("Job", title, [lead, " ", _verdict(compared)]),
         _trained(first, _anchor(own)),
-        _comparison(found, own),
+        _comparison(list(found["table"]["rows"]), own),
+        paired.differences(found, own),
         *_measured(own),
         about.videos(found["videos"], Path(report.path), folder),
         about.commands(found),
@@ -252,7 +258,8 @@ def _has_colors(rows: Sequence[At]) -> bool:
     return any(row["success_held_out"].value is not None for row in rows)
 
 
-_COLUMNS = (
+_Column = tuple[str, str, Callable[[At], Child]]  # a figure, its header, and how it is written
+_COLUMNS: tuple[_Column, ...] = (
     ("success_seen", "Success seen %", share),
     ("success_held_out", "Success held-out %", share),
     ("wrong_target", "Wrong target %", share),
@@ -266,14 +273,25 @@ _COLUMNS = (
 )
 
 
-def _comparison(found: At, own: Sequence[At]) -> Markup:
-    """The table of all methods, and a chart of each method's loss over its success."""
-    rows = list(found["table"]["rows"])
-    shown = [c for c in _COLUMNS if any(row[c[0]].value is not None for row in rows)]
+def _comparison(
+    rows: Sequence[At],
+    own: Sequence[At],
+    who: str = "Method",
+    fields: Sequence[_Column] = _COLUMNS,
+    charted: bool = True,
+) -> Markup:
+    """The table of all runs, and a chart of each run's loss over its success.
+
+    Args:
+        rows: a row of figures for each run.
+        who: what tells the runs apart.
+        charted: whether the figures can be compared, and so be in one chart.
+    """
+    shown = [c for c in fields if any(row[c[0]].value is not None for row in rows)]
     gated = any(run["gate"].value is not None for run in own)
-    header = ["Method", "VQA %", "Lost (points)", "Cross-entropy (nats)", *(c[1] for c in shown)]
+    header = [who, "VQA %", "Lost (points)", "Cross-entropy (nats)", *(c[1] for c in shown)]
     cells = []
-    for row, run in zip(rows, own, strict=True):  # a method's row in the table, and its run
+    for row, run in zip(rows, own, strict=True):
         cell: list[Child] = [
             run["label"],
             share(row["accuracy"]),
@@ -286,13 +304,13 @@ def _comparison(found: At, own: Sequence[At]) -> Markup:
         cells.append(cell)
     explained = "Lost: percentage points of VQA accuracy, with the 95 % interval of one training."
     parts: list[Child] = [note(explained), table(header + ["Gate"] * gated, cells)]
-    # All methods are measured on the same frames, so one value holds for all.
-    hold = next((row["hold_error"] for row in rows if row["hold_error"].value is not None), None)
-    if hold is not None:
+    holds = [row["hold_error"] for row in rows if row["hold_error"]]
+    if len({hold.value for hold in holds}) == 1:  # on the same frames one value holds for all
+        hold = holds[0]
         parts.append(note("Open-loop error of a robot that holds its position: ", decimal(hold, 3)))
     if _acting(rows) == _OPEN:
         parts.append(note("An open-loop error is not a success rate, nor a measure of one."))
-    spots = _spots(rows, own)
+    spots = _spots(rows, own) if charted else []
     if spots:
         errs = _acting(rows) == _OPEN
         over = "open-loop error" if errs else "success"
@@ -300,7 +318,7 @@ def _comparison(found: At, own: Sequence[At]) -> Markup:
         chart = charts.frontier(spots, [], _acting_axis(rows), _LOST, name, turned=errs)
         said = "Better is to the upper right. Bars are 95 % intervals of one training."
         parts.append(figure(chart, said, wide=True))
-    return section("Methods compared", *parts)
+    return section(f"{who}s compared", *parts)
 
 
 _LOST, _OPEN = "VQA accuracy lost (points)", "open_loop_error"
@@ -318,17 +336,66 @@ def _spots(rows: Sequence[At], own: Sequence[At]) -> list[Spot]:
     name = _acting(rows)
     found = []
     for number, (row, run) in enumerate(zip(rows, own, strict=True)):
-        acted = row[name].value
-        if acted is None:
+        acted, lost = row[name].value, row["drop_points"].value
+        if acted is None or lost is None or not row["drop_interval"]:
             continue
         # The interval of a success is in the run, not in the table; a return has none.
         ends = runs.rollout(run, "seen")["interval"].value if name == "success_seen" else None
         wide = None if ends is None else (100 * ends[0], 100 * ends[1])
         across = acted if name == _OPEN else 100 * acted
-        label, lost = str(row["method"]), row["drop_points"].value
         tall = tuple(row["drop_interval"].value)
-        found.append(Spot(label, across, lost, wide, tall, number))
+        found.append(Spot(str(run["label"]), across, lost, wide, tall, number))
     return found
+
+
+# --- several runs ---------------------------------------------------------------------------------
+
+
+def _runs(found: At, report: Any, folder: Path) -> tuple[str, list[Child]]:
+    own, compared = list(found["runs"]), found["comparison"]
+    labels = [str(run["label"]) for run in own]
+    title = ", ".join(labels) if len(labels) <= _NAMED else f"{len(labels)} runs"
+    lead = f"{len(own)} {'run' if len(own) == 1 else 'runs, side by side'}."
+    apart = differences.said(compared["differs"].value)
+    if apart:
+        lead += f" They differ in {apart}: their figures compare more than their methods."
+    made = report.comparison
+    alike = made.same_questions and made.same_episodes and made.same_open_loop
+    one_set = len(made.question_sets) < 2
+    fields: list[_Column] = [] if one_set else [("vqa", "Questions", str)]
+    if labels != [row.method for row in made.rows]:
+        fields.append(("method", "Method", str))
+    fields += [("baseline_accuracy", "Before %", share), *_COLUMNS]
+    parts = [
+        _header("Comparison", title, lead),
+        _comparison(list(compared["rows"]), own, "Run", fields, alike and one_set),
+        paired.differences(compared, own),
+        *_measured(own),
+        *(_part(run, folder) for run in own),
+        about.machine(own),
+        about.commands(found),
+    ]
+    return title, parts
+
+
+_NAMED = 4  # runs that a title names
+
+
+def _part(run: At, folder: Path) -> Markup:
+    """What is only about one of several runs."""
+    title = str(run["label"])
+    lead = f"{run['path']}: {_lead(run)}"
+    return join(
+        section(
+            title,
+            element("p", lead),
+            runs.at_a_glance(run),
+            _trained(run, _anchor([run])),
+            element("details", element("summary", "How to repeat it"), about.command_lines(run)),
+            about.recipe_keys(run, "Every key of its recipe"),
+        ),
+        about.videos(run["videos"], Path(str(run["path"])), folder, f"Videos of {title}"),
+    )
 
 
 # --- studies and streams --------------------------------------------------------------------------
@@ -454,6 +521,7 @@ def _matrix_of(
 _PAGES = {
     "run": _run,
     "job": _job,
+    "comparison": _runs,
     "study": _study,
     "stream-study": _stream_study,
     "robot-stream-study": _robot_stream_study,

@@ -202,7 +202,7 @@ def _by_instruction(run: At, found: At) -> Markup | None:
 def families(runs: Sequence[At]) -> Iterator[Markup]:
     """VQA accuracy by family of questions, with one table for each question set."""
     by_questions = _by_questions(runs)
-    for (name, count, again), found in by_questions.items():
+    for (name, count, again, *_), found in by_questions.items():
         asked, probes = list(found), list(found.values())
         names = list(dict.fromkeys(name for p in probes for name in p["families"].value or ()))
         header = ["Family", "Questions", "Always the commonest %", "Before %"]
@@ -235,20 +235,26 @@ def _every_family(probes: Sequence[At]) -> list[Child]:
     ]
 
 
-def _by_questions(runs: Sequence[At]) -> dict[tuple[str, int, int], dict[str, At]]:
+_Asked = tuple[str, int, int, Any, Any]  # a key of `_by_questions`
+
+
+def _by_questions(runs: Sequence[At]) -> dict[_Asked, dict[str, At]]:
     """The figures of the runs' probes by label, for each question set and number of questions.
 
-    If a run was probed several times, as with other seeds, each time has a separate entry.
+    Runs of other backbones, or other questions of the same name, are apart: what was known before,
+    or the share of the commonest answers, tells them. If a run was probed several times, as with
+    other seeds, each time has a separate entry.
     """
-    found: dict[tuple[str, int, int], dict[str, At]] = {}
+    found: dict[_Asked, dict[str, At]] = {}
     for run in runs:
         label = str(run["label"])
         for name, probed in zip(run["question_sets"], run["probes"], strict=True):
             figures, again = probed["figures"], 0
             count = figures["questions"].value
-            while label in found.get((str(name), count, again), ()):
+            told = figures["majority"].value, figures["baseline_accuracy"].value
+            while label in found.get((str(name), count, again, *told), ()):
                 again += 1
-            found.setdefault((str(name), count, again), {})[label] = figures
+            found.setdefault((str(name), count, again, *told), {})[label] = figures
     return found
 
 
@@ -335,10 +341,12 @@ def drift(runs: Sequence[At]) -> Markup | None:
         w2 = [layer["w2"] for layer in layers]
         points = [(k, at.value) for k, at in enumerate(w2) if is_number(at.value)]
         series.append(Series(str(run["label"]), points, number, True))
-        names = names or [str(layer["layer"]) for layer in layers]
+        own = [str(layer["layer"]) for layer in layers]
+        names = names if len(names) >= len(own) else own  # another backbone may have more layers
         rows.append([run["label"], *map(plain, w2)])
     if not any(s.points for s in series):
         return None
+    rows = [[*row, *["–"] * (1 + len(names) - len(row))] for row in rows]
     chart = charts.lines(series, "layer", "W2²", "drift per layer", log=True)
     legend = charts.legend([(s.name, s.number) for s in series]) if len(runs) > 1 else None
     return section(

@@ -14,6 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from aegis_cli.cli.render.layout import MARKS, Cell, fixed, marked, number, percent, plain_table
+from aegis_cli.cli.render.paired import paired
 from aegis_cli.cli.render.tables import pairs, watched
 from aegis_cli.data.episodes import as_text
 
@@ -318,7 +319,7 @@ _VERDICTS = {True: "passed", False: "failed", None: "-"}
 
 
 def compared(report: Any) -> RenderableType:
-    """A line per run; columns that no run has are left out."""
+    """A line per run, without columns that no run has, and the paired differences."""
     names = [(row.run, row.method, row.task or "-") for row in report.rows]
     shown = _shown_columns(report)
     figures = zip(*shown.values(), strict=True)
@@ -331,7 +332,7 @@ def compared(report: Any) -> RenderableType:
         notes.append("hold's: the open-loop error of the current position, repeated")
     if on is not None and report.same_open_loop:
         notes.append(f"open-loop error: on {on}")
-    return Group(table, *map(Text, notes))
+    return Group(table, *map(Text, notes), *paired(report))
 
 
 def _shown_columns(report: Any) -> dict[str, list[Cell]]:

@@ -111,12 +111,17 @@ def clustered_error(values: np.ndarray, cluster_of: Sequence[int]) -> tuple[floa
     """
     _, cluster = np.unique(np.asarray(cluster_of), return_inverse=True)
     sums, sizes = np.bincount(cluster, values), np.bincount(cluster)  # of each cluster
+    return ratio_error(sums, sizes, float(values.mean())), len(sums)
+
+
+def ratio_error(sums: np.ndarray, sizes: np.ndarray, mean: float) -> float:
+    """The standard error of `clustered_error`, from each cluster's sum and size."""
     count = len(sums)
     if count == 1:
-        return math.inf, 1
-    apart = sums - sizes * values.mean()
+        return math.inf
+    apart = sums - sizes * mean
     of_total = math.sqrt(count / (count - 1) * float(np.square(apart).sum()))
-    return of_total / len(values), count
+    return of_total / float(sizes.sum())
 
 
 def score(graded: Sequence[Graded]) -> Score:
