@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from aegis_cli import methods
-from aegis_cli.common import devices, launch, memory
+from aegis_cli.common import devices, launch, memory, prefetch
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Progress, ignore, loading_told
 from aegis_cli.common.ranks import Ranks, joined, rows_here
@@ -150,7 +150,7 @@ def run(
     track.check(recipe)
     recipe = dataclasses.replace(recipe, train=dataclasses.replace(recipe.train, method=method))
     out = Path(out)
-    with joined() as ranks:
+    with joined() as ranks, prefetch.using(recipe.train.workers):
         if resume:
             recipe = ranks.agree(longer.plan(out, recipe) if ranks.first else recipe)
         if ranks.first:

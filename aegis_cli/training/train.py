@@ -146,7 +146,11 @@ def run(
     chosen = methods.get(method)
     out, places = Path(out), inputs.Inputs.given(demos, anchor)
     # Only one process writes and reports, so its lock of the folder serves all of them.
-    with joined() as ranks, locks.alone(out) if ranks.first else nullcontext():
+    with (
+        joined() as ranks,
+        locks.alone(out) if ranks.first else nullcontext(),
+        prefetch.using(recipe.train.workers),
+    ):
         on_event = on_event if ranks.first else ignore
         if resume:
             recipe = ranks.agree(longer.plan(out, recipe) if ranks.first else recipe)
