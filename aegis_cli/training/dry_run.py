@@ -150,7 +150,9 @@ def run(
     on_event: OnEvent = ignore,
     overwrite: bool = False,
 ) -> DryRunReport:
-    """Build the training, pass one frame through it, time some steps, and write nothing.
+    """Build the training, pass one frame through it, and time some steps.
+
+    Nothing is written but the cache of decoded frames.
 
     If torchrun has started several processes, each calls this, and they share the steps.
 
