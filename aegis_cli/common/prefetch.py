@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
+import sys
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -12,7 +14,7 @@ from typing import TypeVar
 
 import torch
 
-from aegis_cli.common import devices, launch, processes
+from aegis_cli.common import devices, launch, memory, processes
 
 Item = TypeVar("Item")
 T = TypeVar("T")
@@ -69,8 +71,8 @@ def ahead(
     """`map(fetch, items)`, up to `depth` calls ahead in separate threads.
 
     With more `workers` than `depth`, `depth` doubles each time that a result is not ready when it
-    is requested, up to the number of workers. So many results wait in memory only if a few would
-    not be enough.
+    is requested, up to the number of workers or as far as the memory suffices. So many results wait
+    in memory only if a few would not be enough.
 
     A single worker makes the calls in order, so `fetch` may keep state; with several `workers` it
     may not. An exception is raised where its result would be. The threads end with the context.
@@ -119,8 +121,34 @@ def _results(
     for item in items:
         waiting.append(pool.submit(fetch, item))
         if len(waiting) > depth:
-            if depth < workers and not waiting[0].done():
-                depth = min(2 * depth, workers)
-            yield waiting.popleft().result()
+            waited = not waiting[0].done()
+            result = waiting.popleft().result()
+            if waited and depth < workers:
+                depth = min(2 * depth, workers, depth + _room_for(result))
+            yield result
     while waiting:
         yield waiting.popleft().result()
+
+
+def _room_for(result: object) -> int:
+    """How many more such results may be made at the same time.
+
+    Each takes up to twice its size while it is made, and half of the free memory stays free.
+    """
+    free, size = memory.free(torch.device("cpu")), _bytes(result)
+    if free is None or size == 0:
+        return sys.maxsize
+    return free // launch.local_world_size() // (4 * size)
+
+
+def _bytes(thing: object) -> int:
+    """Bytes of the tensors in a result."""
+    if isinstance(thing, torch.Tensor):
+        return thing.nbytes
+    if dataclasses.is_dataclass(thing):
+        return sum(_bytes(getattr(thing, field.name)) for field in dataclasses.fields(thing))
+    if isinstance(thing, Mapping):
+        return sum(map(_bytes, thing.values()))
+    if isinstance(thing, list | tuple):
+        return sum(map(_bytes, thing))
+    return 0

@@ -463,8 +463,8 @@ class Train:
         later=True,
         shapes=False,
         doc="Threads that read and prepare batches for a GPU, in each process; the trained weights "
-        "are the same. Null: this process's share of the cores minus one, at most 16. As many "
-        "batches are in memory at once if steps wait for them.",
+        "are the same. Null: this process's share of the cores minus one, at most 16. If steps "
+        "wait for them, as many batches are in memory at once as fit into half of what is free.",
     )
     parallel: str = key(
         choice(*PARALLEL),

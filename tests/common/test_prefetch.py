@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import threading
 import time
+from dataclasses import dataclass
 
 import pytest
 import torch
 
-from aegis_cli.common import devices, launch, prefetch, processes
+from aegis_cli.common import devices, launch, memory, prefetch, processes
 
 CPU = torch.device("cpu")
 
@@ -85,6 +86,41 @@ def test_every_thread_prepares_where_steps_wait(waits: None) -> None:
     with prefetch.using(9), prefetch.for_device(prepare, range(60), CPU) as made:
         assert list(made) == list(range(60))
     assert most == 9
+
+
+@dataclass(frozen=True)
+class Batch:
+    """A batch as it comes from a thread: tensors in tuples and mappings."""
+
+    images: tuple[torch.Tensor, ...]
+    extra: dict[str, list[torch.Tensor]]
+
+
+@pytest.mark.fast
+@pytest.mark.parametrize("several", [1, 2])
+@pytest.mark.parametrize("short", [0, 1])
+def test_no_more_batches_are_made_at_once_than_there_is_memory_for(
+    several: int, short: int, waits: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Even if steps wait; the processes of one machine share its memory."""
+    size, alive, most, lock = 3000, 0, 0, threading.Lock()
+    # A batch takes twice its size while it is made, and half of the memory stays free.
+    monkeypatch.setattr(memory, "free", lambda _: several * 4 * size - short)
+    monkeypatch.setattr(launch, "local_world_size", lambda: several)
+
+    def prepare(_: int) -> Batch:
+        nonlocal alive, most
+        with lock:
+            alive += 1
+            most = max(most, alive)
+        time.sleep(0.02)
+        return Batch((torch.zeros(1000, dtype=torch.uint8),) * 2, {"a": [torch.zeros(250)]})
+
+    with prefetch.using(50), prefetch.for_device(prepare, range(30), CPU) as made:
+        for _ in made:
+            with lock:
+                alive -= 1
+    assert most == prefetch.DEPTH + 1 if short else most > prefetch.DEPTH + 1
 
 
 def until(holds: object) -> None:
