@@ -393,8 +393,9 @@ def train(
         bool,
         Option(
             "--dry-run",
-            help="Check all inputs, estimate memory, disk and hours, and write nothing (policies "
-            "and streams of robot tasks); exit 1 if memory or disk does not suffice.",
+            help="Check all inputs, estimate memory, disk and hours (policies and streams of robot "
+            "tasks), and write nothing but the cache of decoded frames, which the training then "
+            "reads; exit 1 if memory or disk does not suffice.",
         ),
     ] = False,
     overrides: Set = None,
@@ -1404,8 +1405,8 @@ def run(
         Option(
             "--dry-run",
             help="List the stages, or a study's cells, that would run, and why; for trainings "
-            "whose demonstrations and anchor exist, also memory, disk and hours; write nothing; "
-            "exit 1 if memory or disk does not suffice.",
+            "whose demonstrations and anchor exist, also memory, disk and hours; write nothing but "
+            "the cache of decoded frames; exit 1 if memory or disk does not suffice.",
         ),
     ] = False,
     device: Device = None,

@@ -27,6 +27,7 @@ KEYS: Mapping[str, tuple[str, ...]] = {
     "policy.use_amp": ("train.precision",),
     "policy.compile_model": ("train.compile",),
     "policy.gradient_checkpointing": ("train.gradient_checkpointing",),
+    "num_workers": ("train.workers",),
     "log_freq": ("train.log_every",),
     "save_freq": ("train.checkpoint_every",),
     "optimizer.type": ("train.optimizer",),
@@ -45,6 +46,7 @@ KEYS: Mapping[str, tuple[str, ...]] = {
     # the Trainer
     "per_device_train_batch_size": ("train.batch_size",),
     "gradient_accumulation_steps": ("train.accumulate",),
+    "dataloader_num_workers": ("train.workers",),
     "max_steps": ("train.steps",),
     "logging_steps": ("train.log_every",),
     "save_steps": ("train.checkpoint_every",),

@@ -481,13 +481,12 @@ def _load_folder(
         read = torch.cat([train, validation]).numpy()
         for number in np.unique(index.task[read]).tolist():
             check_text(found.tasks[number])
+    pixels = dict(zip(cameras, sources.pixel_digests(source, cameras), strict=True))
     if cache is None:
-        cache = camera_frames.have_room(
-            source, dict(zip(cameras, digests, strict=True)), image_size, on_event
-        )
+        cache = camera_frames.have_room(source, pixels, image_size, on_event)
     frames: list[Frames] = []
     mapped, videos = list[Path](), set[Path]()
-    for name, own in zip(cameras, digests, strict=True):
+    for name, own in pixels.items():
         is_video = found.info.features[name].dtype != "image"
         # Reading frames that an earlier run has decoded is faster than decoding them again.
         if is_video and not cache and not camera_frames.are_kept(source, name, image_size, own):

@@ -13,12 +13,14 @@ from typing import Any
 import numpy as np
 import torch
 
-from aegis_cli.common import kept_lines
+from aegis_cli.common import devices, kept_lines, prefetch
 from aegis_cli.common.estimates import t_quantile
 from aegis_cli.common.events import OnEvent, Progress, ignore
 from aegis_cli.common.kept_lines import KeptLines
+from aegis_cli.data.batch import RobotBatch
 from aegis_cli.data.demonstrations import Demonstrations
 from aegis_cli.data.vqa.metrics import clustered_error
+from aegis_cli.models.backbones.base import Batch
 from aegis_cli.models.policy import Policy
 from aegis_cli.models.policy_meta import PolicyMeta
 
@@ -35,6 +37,8 @@ def predict(
 ) -> torch.Tensor:
     """Chunks [N, H, A] at frames [N], in raw units; `seed` seeds the flow's noise.
 
+    For a GPU, threads read and process the next batches meanwhile.
+
     Args:
         kept: what was predicted before at these frames under the same circumstances, batch by
             batch, and is not predicted again; what is predicted is added. None keeps nothing.
@@ -44,17 +48,23 @@ def predict(
     found = {} if kept is None else dict(_kept(kept))  # chunks by their first frame's place
     done = sum(map(len, found.values()))
     on_event(Progress(stage, done, len(at), "frames"))
-    for first in range(0, len(at), batch_size):
-        if first in found:
-            continue
-        part = slice(first, first + batch_size)
-        batch = shown.batch(at[part], 1)
-        acted = policy.act_from(batch.images, batch.instructions, batch.proprio, noise[part])
-        found[first] = acted.cpu()
-        if kept is not None:
-            kept.add([_line(first, found[first])])
-        done += len(acted)
-        on_event(Progress(stage, done, len(at), "frames"))
+    backbone = policy.backbone
+    waits = devices.reading_stalls(backbone.device)
+
+    def prepare(first: int) -> tuple[RobotBatch, Batch | None]:
+        batch = shown.batch(at[first : first + batch_size], 1)
+        return batch, backbone.process(batch.images, batch.instructions) if waits else None
+
+    left = [first for first in range(0, len(at), batch_size) if first not in found]
+    with prefetch.for_device(prepare, left, backbone.device) as ready:
+        for first, (batch, inputs) in zip(left, ready, strict=True):
+            part = noise[first : first + batch_size]
+            seen = batch.images, batch.instructions, batch.proprio
+            found[first] = policy.act_from(*seen, part, None, inputs).cpu()
+            if kept is not None:
+                kept.add([_line(first, found[first])])
+            done += len(batch)
+            on_event(Progress(stage, done, len(at), "frames"))
     return torch.cat([found[first] for first in sorted(found)])
 
 

@@ -17,7 +17,7 @@ from aegis_cli.core.continuation import Continued
 from aegis_cli.data.batch import Images, Normalizer, RobotBatch, WholeBatch
 from aegis_cli.data.relative import Origins, Places
 from aegis_cli.models import flow
-from aegis_cli.models.backbones.base import Backbone, Encoding, Suffix
+from aegis_cli.models.backbones.base import Backbone, Batch, Encoding, Suffix
 from aegis_cli.models.expert import ActionExpert
 from aegis_cli.models.structure import digest
 
@@ -188,20 +188,29 @@ class Policy(nn.Module):
         proprio: Tensor,
         noise: Tensor,
         continued: Continued | None = None,
+        inputs: Batch | None = None,
     ) -> Tensor:
-        """The result of `act` for this noise [B, H, A]."""
-        with autocast(self.backbone.device, self.acts_in):
-            return self._acted(images, instructions, proprio, noise, continued)
+        """The result of `act` for this noise [B, H, A].
+
+        Args:
+            inputs: images and instructions as the backbone has processed them ahead; None: it
+                processes them now.
+        """
+        device = self.backbone.device
+        with autocast(device, self.acts_in):
+            if inputs is None:
+                encoding = self.encode(images, instructions)
+            else:
+                encoding = self.backbone.encode(inputs.to(device))
+            return self._acted(encoding, proprio, noise, continued)
 
     def _acted(
         self,
-        images: Images,
-        instructions: Sequence[str],
+        encoding: Encoding,
         proprio: Tensor,
         noise: Tensor,
         continued: Continued | None,
     ) -> Tensor:
-        encoding = self.encode(images, instructions)
         proprio = proprio.to(self.backbone.device)
         state = self.proprio_scale(proprio)
         suffix = self.backbone.suffix(encoding, noise.shape[1])

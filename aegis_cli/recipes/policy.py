@@ -458,6 +458,15 @@ class Train:
         doc="Number of passes that a step's frames are split into, to save memory (gradient "
         "accumulation).",
     )
+    workers: int | None = key(
+        POSITIVE,
+        default=None,
+        later=True,
+        shapes=False,
+        doc="Threads that read and prepare batches for a GPU, in each process; the trained weights "
+        "are the same. Null: this process's share of the cores minus one, at most 16. If steps "
+        "wait for them, as many batches are in memory at once as fit into half of what is free.",
+    )
     parallel: str = key(
         choice(*PARALLEL),
         default="ddp",

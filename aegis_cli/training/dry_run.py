@@ -18,9 +18,9 @@ import torch
 from torch import Tensor, nn
 
 from aegis_cli import methods
-from aegis_cli.common import devices, launch, memory
+from aegis_cli.common import devices, launch, memory, prefetch
 from aegis_cli.common.errors import AegisError
-from aegis_cli.common.events import OnEvent, Progress, ignore, loading_told
+from aegis_cli.common.events import OnEvent, Progress, Warned, ignore, loading_told
 from aegis_cli.common.ranks import Ranks, joined, rows_here
 from aegis_cli.data import mixture
 from aegis_cli.data.demonstrations import Demonstrations
@@ -50,6 +50,9 @@ T = TypeVar("T")
 
 MB = 1e6
 WRITTEN_COPIES = 3  # copies of a tensor while it is checked, hashed and written, as measured
+# Where the documentation says how.
+_SPLITTING = "docs/performance.md, Image splitting"
+_LONG_WAIT = 0.2  # the share of a step's time for which it may wait for its batch
 TIMED_STEPS = 3  # steps, after a first one that includes one-time work
 
 
@@ -79,7 +82,11 @@ class DryRunReport:
         memory_fits: by what was measured, else by the estimate.
         memory_free_mb: on the device that training would run on; None if not known.
         step_s: of one step, the mean of three, or of as many steps as share a method's constraint
-            or anchor gradient; None if there is not enough memory to take them.
+            or anchor gradient, or as a GPU may find prepared; None if there is not enough memory to
+            take them.
+        data_s: how long of `step_s` a step waited for its batch.
+        prepare_s: in which one thread reads and processes a batch; workers: the threads that do so
+            for a GPU, None on a CPU, where the step itself processes what one thread has read.
         validation_s: of one validation, by part: its `loss`, `questions`, `episodes` if none ends
             early, and predicted `actions`; None if there is not enough memory.
         hours: for the remaining steps and validations, without checkpoints.
@@ -108,6 +115,9 @@ class DryRunReport:
     memory_free_mb: float | None
     memory_fits: bool | None
     step_s: float | None
+    data_s: float | None
+    prepare_s: float | None
+    workers: int | None
     validation_s: dict[str, float] | None
     hours: float | None
     checkpoints: int
@@ -140,7 +150,9 @@ def run(
     on_event: OnEvent = ignore,
     overwrite: bool = False,
 ) -> DryRunReport:
-    """Build the training, pass one frame through it, time some steps, and write nothing.
+    """Build the training, pass one frame through it, and time some steps.
+
+    Nothing is written but the cache of decoded frames.
 
     If torchrun has started several processes, each calls this, and they share the steps.
 
@@ -150,7 +162,7 @@ def run(
     track.check(recipe)
     recipe = dataclasses.replace(recipe, train=dataclasses.replace(recipe.train, method=method))
     out = Path(out)
-    with joined() as ranks:
+    with joined() as ranks, prefetch.using(recipe.train.workers):
         if resume:
             recipe = ranks.agree(longer.plan(out, recipe) if ranks.first else recipe)
         if ranks.first:
@@ -197,6 +209,7 @@ def _planned(
     # Last of all: the steps fill the optimizer state and change the weights.
     needs = _needs(training, parts, free, base, ranks, told)
     train.warn_of_written(training.policy.backbone, buffers, told)
+    _warn_of_preparing(needs.timed, _workers(device), told)
     return _report(training, tokens, needs, free, disk, _done(written))
 
 
@@ -212,6 +225,7 @@ def _report(
     """
     recipe, policy, frames = training.recipe, training.policy, len(training.demos.train)
     groups = policy.backbone.parameter_groups()
+    step_s, data_s, prepare_s = needs.timed or (None, None, None)
     return DryRunReport(
         method=training.method.name,
         backbone=recipe.backbone,
@@ -233,7 +247,10 @@ def _report(
         memory_together_mb=_in_mb(needs.together),
         memory_free_mb=_in_mb(free),
         memory_fits=needs.fits,
-        step_s=needs.step_s,
+        step_s=step_s,
+        data_s=data_s,
+        prepare_s=prepare_s,
+        workers=_workers(policy.backbone.device),
         validation_s=needs.validation_s,
         hours=_hours(recipe.train, needs, done),
         checkpoints=disk.checkpoints,
@@ -246,10 +263,10 @@ def _report(
 
 def _hours(settings: Train, needs: _Needs, done: int) -> float | None:
     """Hours for the steps after the first `done` ones, and for their validations."""
-    if needs.step_s is None or needs.validation_s is None:
+    if needs.timed is None or needs.validation_s is None:
         return None
     validations = _left(settings, settings.validate_every, done)
-    seconds = needs.step_s * (settings.steps - done)
+    seconds = needs.timed.step_s * (settings.steps - done)
     seconds += sum(needs.validation_s.values()) * validations
     return seconds / 3600
 
@@ -274,6 +291,14 @@ def _sets(training: TrainingRun) -> dict[str, dict[str, float]] | None:
     return found or None
 
 
+class _Timed(NamedTuple):
+    """Seconds: of a step, of which it waits for its batch, and of a thread per batch."""
+
+    step_s: float
+    data_s: float
+    prepare_s: float
+
+
 class _Needs(NamedTuple):
     """What the processes need, in bytes.
 
@@ -282,7 +307,7 @@ class _Needs(NamedTuple):
         measured: the most that a process took; None if no step was taken.
         together: for the processes that share a machine's memory; None if none do.
         fits: whether every process has what it needs; None if the free memory is not known.
-        step_s: seconds per step; None if none was taken.
+        timed: the times of a step; None if none was taken.
         validation_s: seconds of one validation, by part; None if none was started.
     """
 
@@ -290,7 +315,7 @@ class _Needs(NamedTuple):
     measured: int | None
     together: int | None
     fits: bool | None
-    step_s: float | None
+    timed: _Timed | None
     validation_s: dict[str, float] | None
 
 
@@ -310,10 +335,10 @@ def _needs(
     """
     device, needed = training.policy.backbone.device, sum(parts.values())
     fits = fits_in(needed, free, device, ranks)
-    step_s, validation_s, measured = None, None, None
+    timed, validation_s, measured = None, None, None
     if fits is not False:
-        step_s = where_it_fits(partial(_timed, training, on_event), ranks)
-        if step_s is not None:
+        timed = where_it_fits(partial(_timed, training, on_event), ranks)
+        if timed is not None:
             # After the steps, since gradients and optimizer state exist during a validation:
             # together they are part of the training's peak.
             measure = partial(validation_time.measured, training, on_event)
@@ -326,7 +351,7 @@ def _needs(
         fits = fits_in(needed, free, device, ranks)
     largest = max(ranks.gathered(parts), key=lambda found: sum(found.values()))
     together = _together(needed, device, ranks)
-    return _Needs(largest, measured, together, fits, step_s, validation_s)
+    return _Needs(largest, measured, together, fits, timed, validation_s)
 
 
 def _frames_of_a_pass(settings: Train, ranks: Ranks) -> int:
@@ -560,8 +585,35 @@ def where_it_fits(found: Callable[[], T], ranks: Ranks) -> T | None:
         return None
 
 
-def _timed(training: TrainingRun, on_event: OnEvent) -> float:
-    """Seconds per step, measured on the training's first steps; nothing is written.
+def _workers(device: torch.device) -> int | None:
+    """Threads that prepare batches; None on a CPU."""
+    return prefetch.workers() if devices.reading_stalls(device) else None
+
+
+def _warn_of_preparing(timed: _Timed | None, workers: int | None, on_event: OnEvent) -> None:
+    """Warn if steps wait for their batches to be prepared."""
+    if timed is None:
+        return
+    splits = (
+        "if the model's processor splits images or scales them up, switch that off in its "
+        f"configuration ({_SPLITTING})"
+    )
+    step_s, data_s, prepare_s = (f"{seconds:,.2f}" for seconds in timed)
+    if workers is not None and timed.data_s > _LONG_WAIT * timed.step_s:
+        text = (
+            f"a step waits {data_s} of its {step_s} s for its batch: preparing one takes a thread "
+            f"{prepare_s} s, and there are {workers}; {splits}, or set train.workers higher where "
+            "there are more cores"
+        )
+        on_event(Warned("dry run", text))
+    # On a CPU the step itself does most of this.
+    if workers is None and timed.prepare_s > timed.step_s / 2:
+        text = f"preparing a batch takes {prepare_s} of a step's {step_s} s; {splits}"
+        on_event(Warned("dry run", text))
+
+
+def _timed(training: TrainingRun, on_event: OnEvent) -> _Timed:
+    """The times of a step, measured on the training's first steps; nothing is written.
 
     Raises:
         Diverged: a step at which the training would end, too.
@@ -574,18 +626,23 @@ def _timed(training: TrainingRun, on_event: OnEvent) -> float:
     ahead = 1 + ready
     steps = range(min(ahead + timed, settings.steps))
     first = steps[ahead : ahead + 1] or steps  # the first that is timed
-    window, started_s = train.Window(), 0.0
+    window, started_s, data_s = train.Window(), 0.0, 0.0
     training.policy.train()
     on_event(Progress("dry run", 0, len(steps), "steps"))
+    prepare_s = train.preparing_s(training)
     with train.batches_of(training, steps) as batches:
         for index in steps:
             if index == first[0]:
                 train.read_figures(training, window)  # waits until the GPU has finished
-                started_s = time.perf_counter()
-            train.update(training, index, next(batches), window)
+                started_s, data_s = time.perf_counter(), 0.0
+            asked_s = time.perf_counter()
+            batch = next(batches)
+            data_s += time.perf_counter() - asked_s
+            train.update(training, index, batch, window)
             on_event(Progress("dry run", index + 1, len(steps), "steps"))
         train.read_figures(training, window)
-    return (time.perf_counter() - started_s) / (len(steps) - first[0])
+    seconds, count = time.perf_counter() - started_s, len(steps) - first[0]
+    return _Timed(seconds / count, data_s / count, prepare_s)
 
 
 # --- disk -----------------------------------------------------------------------------------------

@@ -146,7 +146,11 @@ def run(
     chosen = methods.get(method)
     out, places = Path(out), inputs.Inputs.given(demos, anchor)
     # Only one process writes and reports, so its lock of the folder serves all of them.
-    with joined() as ranks, locks.alone(out) if ranks.first else nullcontext():
+    with (
+        joined() as ranks,
+        locks.alone(out) if ranks.first else nullcontext(),
+        prefetch.using(recipe.train.workers),
+    ):
         on_event = on_event if ranks.first else ignore
         if resume:
             recipe = ranks.agree(longer.plan(out, recipe) if ranks.first else recipe)
@@ -607,33 +611,64 @@ def _fetching(run: TrainingRun) -> Callable[[int], RobotBatch]:
 
     Several threads may call it.
     """
-    settings, seed = run.recipe.train, run.recipe.seed
     order = run.order
     waits = devices.reading_stalls(run.policy.backbone.device)
 
     def fetch(index: int) -> RobotBatch:
-        rows = order.rows(index)
-        of_step = run.demos.train[rows]
-        own = step.own_rows(torch.arange(len(rows)), run.ranks, settings.accumulate)
-        frames = of_step[own]
-        batch = run.demos.batch(frames, settings.chunk)
-        if settings.augment is not None:
-            # A batch may contain a frame twice, each time with another draw. Repeats are counted
-            # over all frames of the step, whichever process takes them.
-            repeats = torch.tensor(augment.earlier(of_step.tolist()))[own].tolist()
-            images = augment.augmented(
-                batch.images,
-                frames.tolist(),
-                settings.augment,
-                settings.augment_count,
-                seed,
-                index,
-                repeats,
-            )
-            batch = dataclasses.replace(batch, images=images)
+        of_step = run.demos.train[order.rows(index)]
+        batch = _read(run, of_step, _own(run, of_step), index)
         return prepared(run, batch, of_step, index) if waits else batch
 
     return fetch
+
+
+def _own(run: TrainingRun, of_step: Tensor) -> Tensor:
+    """The places of this process's frames among all frames of a step."""
+    return step.own_rows(torch.arange(len(of_step)), run.ranks, run.recipe.train.accumulate)
+
+
+def _read(run: TrainingRun, of_step: Tensor, own: Tensor, index: int) -> RobotBatch:
+    """The frames at the places `own` of a step's frames, augmented."""
+    settings, frames = run.recipe.train, of_step[own]
+    batch = run.demos.batch(frames, settings.chunk)
+    if settings.augment is None:
+        return batch
+    # A batch may contain a frame twice, each time with another draw. Repeats are counted over all
+    # frames of the step, whichever process takes them.
+    repeats = torch.tensor(augment.earlier(of_step.tolist()))[own].tolist()
+    images = augment.augmented(
+        batch.images,
+        frames.tolist(),
+        settings.augment,
+        settings.augment_count,
+        run.recipe.seed,
+        index,
+        repeats,
+    )
+    return dataclasses.replace(batch, images=images)
+
+
+def preparing_s(run: TrainingRun, most: int = 8) -> float:
+    """Seconds in which one thread reads this process's frames of a step, and processes them.
+
+    It is measured on up to `most` of the first step's frames.
+    """
+    of_step = run.demos.train[run.order.rows(0)]
+    own = _own(run, of_step)
+
+    def prepare(places: Tensor) -> float:
+        began = time.perf_counter()
+        batch = _read(run, of_step, places, 0)
+        shown = [batch]
+        if run.parts.fraction < 1:
+            shown.append(step.first_frames(batch, run.parts.fraction))
+        for each in shown:
+            run.policy.backbone.process(each.images, each.instructions)
+        return time.perf_counter() - began
+
+    # In such a thread, which has one core.
+    with prefetch.ahead(prepare, [own[:most]]) as seconds:
+        return next(seconds) * len(own) / min(most, len(own))
 
 
 def prepared(run: TrainingRun, batch: RobotBatch, frames: Tensor, index: int) -> RobotBatch:

@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 import json
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from samples.training_runs import small_policy
 
-from aegis_cli.common import artifacts, cache, version
+from aegis_cli.common import artifacts, cache, devices, prefetch, version
+from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import Event, OnEvent, Progress, ignore
+from aegis_cli.data import demonstrations
 from aegis_cli.evaluation import open_loop
+from aegis_cli.models import backbones
+from aegis_cli.models.action_errors import predict
+from aegis_cli.models.backbones.embedded import EmbeddedVLM
 from aegis_cli.models.policy import Policy
 from aegis_cli.models.policy_meta import PolicyMeta
 from aegis_cli.training import checkpoint
@@ -139,3 +146,89 @@ def test_what_is_damaged_is_predicted_again(evaluate: Evaluate, predicted: list[
     store().write_text(kept[:-30])
     assert evaluate() == wanted
     assert sum(predicted) == 4 * BATCH + FRAMES % BATCH
+
+
+# --- threads that prepare the next batches --------------------------------------------------------
+
+
+@pytest.fixture
+def waits(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The CPU is treated as a GPU, for which threads prepare."""
+    monkeypatch.setattr(devices, "reading_stalls", lambda _: True)
+
+
+@pytest.fixture
+def processed(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The names of threads for each batch that was processed; the loading processes one too."""
+    seen: list[str] = []
+    plain = EmbeddedVLM.process
+
+    def noted(self: EmbeddedVLM, *given: Any) -> Any:
+        seen.append(threading.current_thread().name)
+        return plain(self, *given)
+
+    monkeypatch.setattr(EmbeddedVLM, "process", noted)
+    return seen
+
+
+def test_threads_prepare_the_batches_of_a_gpu_for_the_same_report(
+    evaluate: Evaluate, processed: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wanted = evaluate()
+    assert not any(name.startswith("prefetch") for name in processed)
+    store().unlink()
+    del processed[:]
+    monkeypatch.setattr(devices, "reading_stalls", lambda _: True)
+    with prefetch.using(3):
+        assert evaluate() == wanted
+    assert sum(name.startswith("prefetch") for name in processed) == 6
+
+
+def test_no_batch_that_is_kept_is_prepared_again(
+    evaluate: Evaluate, processed: list[str], waits: None
+) -> None:
+    stop_after(4, evaluate)
+    del processed[:]
+    found = evaluate()
+    assert sum(name.startswith("prefetch") for name in processed) == 2
+    store().unlink()
+    assert evaluate() == found
+
+
+@pytest.mark.parametrize("family", ["smolvlm", "paligemma"])
+def test_a_hugging_face_model_predicts_the_same_from_what_threads_prepare(
+    family: str,
+    hf_folder: Callable[[str], Path],
+    demos_file: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    backbone = backbones.load(str(hf_folder(family)))
+    shown = demonstrations.load(demos_file, 0.5, 0)
+    policy = small_policy(backbone, shown).eval()
+    given = policy, shown, shown.validation[:7], 5, 3, "predict"
+    alone = predict(*given)
+    monkeypatch.setattr(devices, "reading_stalls", lambda _: True)
+    with prefetch.using(2):
+        assert torch.equal(predict(*given), alone)
+
+
+def test_what_fails_in_a_thread_is_raised_and_no_thread_goes_on(
+    evaluate: Evaluate, waits: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def damaged(*_: object) -> None:
+        raise AegisError("a damaged video", "a whole one", "get it again")
+
+    monkeypatch.setattr(EmbeddedVLM, "process", damaged)
+    with pytest.raises(AegisError, match="a damaged video"):
+        evaluate()
+    assert not any(thread.name.startswith("prefetch") for thread in threading.enumerate())
+
+
+def test_an_interrupt_ends_the_threads(evaluate: Evaluate, waits: None) -> None:
+    def stop(event: Event) -> None:
+        if isinstance(event, Progress) and event.unit == "frames" and event.done == 2 * BATCH:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        evaluate(stop)
+    assert not any(thread.name.startswith("prefetch") for thread in threading.enumerate())

@@ -90,7 +90,7 @@ def read(folder: Path, camera: str | None = None, side: int | None = None) -> np
     found = dataset.load(folder)
     (key,) = found.cameras(camera)
     read = source.find(found)
-    digest = source.digests(read, [key])[0]
+    digest = source.pixel_digests(read, [key])[0]
     index = rows.read_index(read)
     return camera_frames.load(read, index, key, side, digest, 1, lambda _: None)[0]
 

@@ -144,6 +144,7 @@ def small_policy(backbone: backbones.Backbone, demos: demonstrations.Demonstrati
         actions,
         SETTINGS.chunk,
         width=16,
+        kv_heads=None if backbone.kv_heads == backbone.heads else backbone.kv_heads,
     )
     return Policy(backbone, ActionExpert(shape), *demos.scales())
 

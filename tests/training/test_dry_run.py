@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -21,8 +22,10 @@ from samples.tiny import make_tiny
 from torch import nn
 
 from aegis_cli import recipes
-from aegis_cli.common.events import Event, Progress
+from aegis_cli.common import devices
+from aegis_cli.common.events import Event, Progress, Warned
 from aegis_cli.models import backbones
+from aegis_cli.models.backbones.embedded import EmbeddedVLM
 from aegis_cli.recipes.keys import LARGEST
 from aegis_cli.training import checkpoint, dry_run, train
 from aegis_cli.training.dry_run import DryRunReport
@@ -182,7 +185,7 @@ def test_processes_plan_what_each_of_them_needs(
     for way, planned in plans.items():
         first, second = (json.loads((planned.said / f"{k}.json").read_text()) for k in (0, 1))
         # These depend on the process's own clock and moment.
-        ours = ("step_s", "validation_s", "hours", "memory_free_mb")
+        ours = ("step_s", "data_s", "prepare_s", "validation_s", "hours", "memory_free_mb")
         assert [k for k in first if first[k] != second[k] and k not in ours] == []
         assert (first["processes"], first["memory_fits"]) == (2, True)
         assert first["memory_together_mb"] > first["memory_measured_mb"] > 0 < first["hours"]
@@ -304,7 +307,7 @@ def test_steps_are_timed_as_training_takes_them_and_the_memory_is_not_theirs(
     monkeypatch.setattr(train, "update", noting)
     timed = dry_run.run(settings, *given)
     assert taken == list(range(steps))
-    monkeypatch.setattr(dry_run, "_timed", lambda *_: 0.0)
+    monkeypatch.setattr(dry_run, "_timed", lambda *_: dry_run._Timed(0.0, 0.0, 0.0))
     assert dry_run.run(settings, *given).memory_mb == timed.memory_mb
     short = dataclasses.replace(settings, train=dataclasses.replace(settings.train, steps=1))
     assert dry_run.run(short, *given).step_s == 0.0
@@ -522,3 +525,62 @@ def test_modules_under_an_unused_name_are_not_kept() -> None:
     module = nn.ModuleDict({"a": nn.Linear(2, 2, bias=False)})
     module["b"] = module["a"]
     assert dry_run._bytes(dry_run._tensors(module)) == 16
+
+
+def slower(real: Callable[..., Any], seconds: float) -> Callable[..., Any]:
+    """A function that takes at least so long, however busy the machine is."""
+
+    def slowly(*given: Any) -> Any:
+        time.sleep(seconds)
+        return real(*given)
+
+    return slowly
+
+
+@pytest.mark.parametrize("slow_s", [0.0, 0.5])
+def test_a_dry_run_says_if_steps_wait_for_threads_that_prepare_their_batches(
+    slow_s: float,
+    tiny_folder: Path,
+    demos_file: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """And its hours include it."""
+    monkeypatch.setattr(devices, "reading_stalls", lambda _: True)
+    monkeypatch.setattr(EmbeddedVLM, "process", slower(EmbeddedVLM.process, slow_s))
+    if not slow_s:
+        monkeypatch.setattr(train, "update", slower(train.update, 0.3))
+    settings, notes = small(tiny_folder), list[Event]()
+    steps = 20
+    settings = replace(settings, train=replace(settings.train, workers=2, steps=steps))
+    report = dry_run.run(
+        settings, "naive", demos_file, None, tmp_path / "out", on_event=notes.append
+    )
+    assert report.workers == 2 and report.prepare_s is not None and report.step_s is not None
+    told = [e.text for e in notes if isinstance(e, Warned) and "train.workers" in e.text]
+    assert report.prepare_s >= slow_s and len(told) == (1 if slow_s else 0)
+    if slow_s:
+        # Two threads prepare two batches in that time.
+        assert 0.7 * slow_s / 2 < report.step_s < slow_s
+        assert report.data_s is not None and 0.2 * report.step_s < report.data_s < report.step_s
+        assert "docs/performance.md" in told[0] and "there are 2" in told[0]
+        assert report.hours is not None and report.hours * 3600 > steps * slow_s / 2 * 0.7
+
+
+def test_a_dry_run_says_if_preparing_batches_takes_most_of_a_step_on_a_cpu(
+    tiny_folder: Path, demos_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def told() -> list[str]:
+        notes: list[Event] = []
+        report = dry_run.run(
+            small(tiny_folder), "naive", demos_file, None, tmp_path / "out", on_event=notes.append
+        )
+        assert report.workers is None
+        return [e.text for e in notes if isinstance(e, Warned) and "preparing" in e.text]
+
+    with monkeypatch.context() as patch:
+        patch.setattr(train, "update", slower(train.update, 0.3))
+        assert told() == []
+    monkeypatch.setattr(EmbeddedVLM, "process", slower(EmbeddedVLM.process, 1.0))
+    (text,) = told()
+    assert "splits images" in text

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +16,7 @@ from typing import Any
 
 import pytest
 import torch
-from samples.training_runs import SETTINGS, Start, metrics
+from samples.training_runs import SETTINGS, Start, metrics, stop_at
 from torch import Tensor
 
 from aegis_cli.common import artifacts, devices, prefetch
@@ -205,6 +206,40 @@ def test_batches_that_several_threads_prepare_are_those_of_one(
         assert torch.equal(one.actions, other.actions)
         assert torch.equal(one_part.inputs.pixels, other_part.inputs.pixels)
         assert torch.equal(one_part.inputs.ids, other_part.inputs.ids)
+
+
+def test_a_run_goes_on_with_another_number_of_threads_to_the_same_weights(
+    recipe: Recipe, start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, waits: None
+) -> None:
+    started: list[int] = []
+
+    class Counted(ThreadPoolExecutor):
+        def __init__(self, workers: int, *rest: object, **named: Any) -> None:
+            super().__init__(workers, *rest, **named)
+            started.append(workers)
+
+    monkeypatch.setattr(prefetch, "ThreadPoolExecutor", Counted)
+
+    def of(workers: int) -> Recipe:
+        return replace(recipe, train=replace(LATER, checkpoint_every=2, workers=workers))
+
+    start("naive", tmp_path / "whole", recipe=of(5))
+    assert max(started) == 5
+    started.clear()
+    with pytest.raises(KeyboardInterrupt):
+        stop = stop_at(3, KeyboardInterrupt())
+        start("naive", tmp_path / "resumed", recipe=of(1), on_event=stop)
+    assert max(started) == 1
+    start("naive", tmp_path / "resumed", recipe=of(7), resume=True)
+    assert max(started) == 7
+    whole, resumed = (
+        artifacts.load(
+            tmp_path / name / "checkpoints/last/training_state/state.safetensors"
+        ).tensors
+        for name in ("whole", "resumed")
+    )
+    for name, tensor in whole.items():
+        assert torch.equal(tensor, resumed[name]), name
 
 
 @pytest.mark.parametrize("decay", [None, 0.6])

@@ -2,9 +2,10 @@
 
 Several processes decode.
 
-The file is named by the digest of its source, so runs share it, and a changed dataset gets a new
-one. It lies in $AEGIS_CACHE, else in $XDG_CACHE_HOME/aegis or ~/.cache/aegis; if it is deleted, the
-frames are decoded again.
+The file is named by the digest of what its pixels depend on, so runs share it, and a dataset whose
+pictures change gets a new one. It lies in $AEGIS_CACHE, else in $XDG_CACHE_HOME/aegis or
+~/.cache/aegis; if it is deleted, the frames are decoded again. Files that no run has used for a
+month are deleted when another one is written.
 """
 
 from __future__ import annotations
@@ -121,7 +122,7 @@ def load(
     Args:
         side: pixels of the square that each frame is fitted into; None: frames keep their size, or
             are fitted to the first one's.
-        digest: digest of everything the frames are decoded from.
+        digest: of what the frames are decoded from, as `source.pixel_digests` gives it.
         workers: processes; the frames do not depend on it. Default: up to one per core, fewer for
             few frames.
 
@@ -141,6 +142,7 @@ def load(
         _write(path, parts, (count, height, width, 3), workers, camera, on_event)
     frames = _open(path, count)
     if kept:
+        cache.mark_read(path)
         _check_some(path, frames, source, index, camera)
     return frames, path
 
@@ -339,6 +341,7 @@ def _write(
 ) -> None:
     """Decode a camera's frames into a file beside `path`, then rename it."""
     files.sweep_all(path.parent)  # left over from killed processes
+    cache.sweep(path.parent)
     count = sum(part.count for part in parts)
     needed, free = count * int(np.prod(shape[1:])), shutil.disk_usage(path.parent).free
     if needed > free:

@@ -8,6 +8,7 @@ LeRobot itself reads all existing files.
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -234,6 +235,44 @@ def digests(source: Source, cameras: Sequence[str], on_event: OnEvent = ignore) 
         own = {str(path): hashes[wanted[path]] for path in shared | clips[camera]}
         found.append(files.sha256_value({"camera": camera, "files": own}))
     return found
+
+
+def pixel_digests(source: Source, cameras: Sequence[str]) -> list[str]:
+    """A digest per camera of what its decoded frames depend on.
+
+    This is the content of its videos, and where and when each frame is in them. For a camera with
+    embedded images it is the content of the row files. No words of the meta folder are part of it.
+    """
+    dataset = source.dataset
+    data = {str(file.path.relative_to(dataset.folder)): file.path for file in source.data}
+    # Of all episodes, because frames keep their numbers in the whole dataset.
+    lengths = [episode.length for episode in dataset.episodes]
+    found = []
+    for camera in cameras:
+        about: dict[str, Any] = {"lengths": lengths}
+        if dataset.info.features[camera].dtype == "image":
+            hashes = kept_digests.of_files(data.values(), dataset.folder, fix=layout.AGAIN)
+            about["rows"] = {name: hashes[path] for name, path in data.items()}
+        else:
+            clips = [episode.clips[camera] for episode in dataset.episodes]
+            read = {str(clips[number].file) for number in source.episodes}
+            videos = {name: dataset.folder / name for name in sorted(read)}
+            hashes = kept_digests.of_files(videos.values(), dataset.folder, fix=layout.AGAIN)
+            about["videos"] = {name: hashes[path] for name, path in videos.items()}
+            about["clips"] = [[str(clip.file), clip.start_s] for clip in clips]
+            about["times"] = {name: _digest_of_times(path) for name, path in data.items()}
+            about["fps"] = dataset.info.fps
+        found.append(files.sha256_value(about))
+    return found
+
+
+def _digest_of_times(path: Path) -> str:
+    """sha256 of the episode and the time of each row in a data file."""
+    with layout.reading_parquet(path):
+        times = column(layout.open_parquet(path), path, "timestamp")
+    digest = hashlib.sha256(_episode_of_rows(path).tobytes())
+    digest.update(numbers(times, "timestamp", path).tobytes())
+    return digest.hexdigest()
 
 
 def joined_digest(digests: Sequence[str], of: str) -> str:

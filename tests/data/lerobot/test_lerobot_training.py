@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -237,6 +239,89 @@ def test_other_frames_and_another_size_are_other_files(tmp_path: Path, frame_cac
             save(tmp_path / f"{number}", episodes(seed=seed)), 0.3, 0, image_size=size
         )
     assert len(list((frame_cache / "frames").iterdir())) == 3
+
+
+@pytest.mark.parametrize("as_video", [False, True])
+def test_words_about_the_same_pictures_decode_nothing_again(
+    as_video: bool, tmp_path: Path, frame_cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Those of info.json, and beside a video also the tasks' texts and the actions."""
+    folder = save(tmp_path / "d", episodes(smooth=True), as_video=as_video)
+    before = demonstrations.load(folder, 0.3, 0)
+
+    def rename(table: pa.Table) -> pa.Table:
+        texts = [f"please {text}" for text in table.column("task").to_pylist()]
+        return replaced(table, "task", pa.array(texts))
+
+    def act(table: pa.Table) -> pa.Table:
+        rows = [[0.5 for _ in row] for row in table.column("action").to_pylist()]
+        return replaced(table, "action", pa.array(rows, table.schema.field("action").type))
+
+    edit_info(folder, lambda info: info.update(robot_type="another arm", comment="corrected"))
+    if as_video:
+        edit_table(folder / "meta" / "tasks.parquet", rename)
+        edit_table(data_files(folder)[0], act)
+    monkeypatch.setattr(camera_frames, "_write", lambda *_: pytest.fail("decoded again"))
+    after = demonstrations.load(folder, 0.3, 0)
+    assert after.sha256 != before.sha256 and torch.equal(after.frames[0], before.frames[0])
+    assert not as_video or after.instructions[0].startswith("please ")
+    assert len(list((frame_cache / "frames").iterdir())) == 1
+
+
+@pytest.mark.parametrize("change", ["pictures", "times", "starts"])
+def test_other_pixels_under_the_same_words_are_decoded_anew(
+    change: str, tmp_path: Path, frame_cache: Path
+) -> None:
+    made = episodes(smooth=True)
+    folder = save(tmp_path / "d", made, as_video=True)
+    demonstrations.load(folder, 0.3, 0)
+    if change == "pictures":
+        opposite = [
+            replace(e, frames={name: 255 - shown for name, shown in e.frames.items()}) for e in made
+        ]
+        other = save(tmp_path / "other", opposite, as_video=True)
+        shutil.rmtree(folder / "videos")
+        shutil.copytree(other / "videos", folder / "videos")
+    elif change == "times":
+        edit_table(data_files(folder)[0], lambda table: shifted(table, "timestamp"))
+    else:
+        (table,) = (folder / "meta" / "episodes").rglob("*.parquet")
+        edit_table(
+            table, lambda found: shifted(found, "videos/observation.images.top/from_timestamp")
+        )
+    # Later by a tenth of a frame, a time is still that of the same frame.
+    loaded = demonstrations.load(folder, 0.3, 0).frames[0].float()
+    wanted = torch.from_numpy(frames(made)).float()
+    wanted = 255 - wanted if change == "pictures" else wanted
+    assert (loaded - wanted).abs().mean() < 4
+    assert len(list((frame_cache / "frames").iterdir())) == 2
+
+
+def shifted(table: pa.Table, name: str) -> pa.Table:
+    """The table with the times of a column later by a tenth of a frame."""
+    times = [time + 0.01 for time in table.column(name).to_pylist()]
+    return replaced(table, name, pa.array(times, table.schema.field(name).type))
+
+
+def test_decoded_frames_that_nobody_uses_any_more_are_removed(
+    tmp_path: Path, frame_cache: Path
+) -> None:
+    """Using them does not count as writing them, for which a training that reads them would end."""
+    long_ago = time.time() - 31 * 86_400
+    folders = [save(tmp_path / name, episodes(seed=seed)) for seed, name in enumerate("abc")]
+    demonstrations.load(folders[0], 0.3, 0)
+    (unused,) = (frame_cache / "frames").iterdir()
+    demonstrations.load(folders[1], 0.3, 0)
+    (used,) = set((frame_cache / "frames").iterdir()) - {unused}
+    for path in (unused, used):
+        os.utime(path, (long_ago, long_ago))
+    training = demonstrations.load(folders[1], 0.3, 0)
+    demonstrations.load(folders[1], 0.3, 0)
+    training.check_files()
+    demonstrations.load(folders[2], 0.3, 0)
+    assert not unused.exists() and used.exists()
+    demonstrations.load(folders[0], 0.3, 0)  # decoded again
+    assert unused.exists()
 
 
 def test_writing_to_loaded_frames_does_not_reach_the_disk(tmp_path: Path) -> None:
