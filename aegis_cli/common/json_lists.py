@@ -109,11 +109,11 @@ class _Text:
         self._at += 1
 
     def value(self) -> Any:
-        """Go past the next value."""
-        self.peek()
+        """Go past the next value and the spaces after it, to what follows."""
         while True:
             try:
-                found, end = _DECODE(self._text, self._at)
+                at = _SPACE(self._text, self._at).end()  # type: ignore[union-attr]
+                found, end = _DECODE(self._text, at)
             except ValueError:
                 if self._is_whole:
                     raise
@@ -132,12 +132,13 @@ class _Text:
         if self.peek() == "]":
             self._at += 1
             return
-        while True:
+        mark = ","
+        while mark == ",":
             yield self.value()
-            if self.peek() == "]":
-                self._at += 1
-                return
-            self.take(",")
+            mark = self._text[self._at]
+            self._at += 1
+        if mark != "]":
+            raise Unusual(f"{mark} after an item")
 
     def end(self) -> None:
         """Make sure that nothing follows."""

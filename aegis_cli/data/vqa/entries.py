@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 import stat
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -89,8 +89,13 @@ def make_question(where: str, text: Any, answers: Any, name: Any, family: str) -
     """
     if not _is_text(text):
         raise bad(where, f"question {_show(text)}", "a text", "write what is asked")
-    answers = [answers] if type(answers) is str else texts(answers)
-    if not answers or not all(_is_text(a) for a in answers):
+    answers = [answers] if type(answers) is str else answers
+    distinct: Collection[Any]
+    if type(answers) is list and set(map(type, answers)) == {str}:
+        distinct = set(answers)  # most people answer alike
+    else:
+        distinct = answers = _texts(answers)
+    if not distinct or not all(map(_is_text, distinct)):
         found = f"answers {_show(answers)}" if answers else "no answer"
         expected = "a list of one or more texts, what people answered"
         raise bad(where, found, expected, 'write e.g. ["red"]')
@@ -100,7 +105,7 @@ def make_question(where: str, text: Any, answers: Any, name: Any, family: str) -
     return Question(family, text.strip(), reference(said).strip(), said, name)
 
 
-def texts(answers: Any) -> list[Any]:
+def _texts(answers: Any) -> list[Any]:
     """The answers as a list, with whole numbers as texts."""
     if isinstance(answers, dict):  # older versions store lists of objects as columns
         answers = answers.get("answer")

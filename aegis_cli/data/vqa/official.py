@@ -7,6 +7,7 @@ folder.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import sys
 from collections.abc import Callable, Iterable, Iterator
@@ -25,7 +26,6 @@ from aegis_cli.data.vqa.entries import (
     bad,
     in_mb,
     make_question,
-    texts,
 )
 from aegis_cli.data.vqa.images import Picture
 
@@ -144,10 +144,10 @@ def _told(
 
 def _slim(row: dict[str, Any]) -> _Annotation:
     """An annotation in little memory: its answers are a few words that occur a million times."""
-    answers = row.get("answers")
-    said = texts(answers)
-    if all(type(answer) is str for answer in said):
-        answers = [sys.intern(answer) for answer in said]
+    answers: Any = row.get("answers")
+    if type(answers) is list:
+        with contextlib.suppress(KeyError, TypeError):  # other forms stay as they are
+            answers = [sys.intern(each["answer"]) for each in answers]
     return _Annotation(row.get("image_id"), answers, row.get("answer_type"))
 
 
@@ -214,7 +214,7 @@ class _Images:
                 "take the official file, or write a .jsonl file of your own",
             )
         self.part, self._folders = part, (questions.parent / part, questions.parent)
-        self._found: dict[int, Path] = {}
+        self._found: dict[int, str] = {}
 
     def picture(self, where: str, number: Any) -> Picture:
         """The image of this number.
@@ -226,7 +226,7 @@ class _Images:
             raise bad(where, f"image_id {number!r}", "a whole number", "correct the file")
         name = f"COCO_{self.part}_{number:012d}.jpg"
         if number not in self._found:  # several questions share an image
-            places = [folder / name for folder in self._folders]
+            places = [os.path.join(folder, name) for folder in self._folders]
             path = next((place for place in places if os.path.isfile(place)), None)
             if path is None:
                 raise bad(
