@@ -209,7 +209,8 @@ def _draw(report: Any, path: Path, plot: Path) -> None:
     elif report.kind == "questions":
         from aegis_cli.data.vqa import summary
 
-        summary.save_sheet(str(path), plot)
+        with render.progress() as on_event:
+            summary.save_sheet(str(path), plot, on_event)
     elif report.kind == "dataset":
         from aegis_cli.data.lerobot import dataset, download, summary
 

@@ -60,7 +60,7 @@ def run(
     questions only one split, which may be named after a #.
 
     Only an artifact's header is read, unless figures need the tensors. This is fast, so `on_event`
-    is only called for images.
+    is only called for questions.
 
     Args:
         images: whether to decode every image that questions are about.

@@ -8,7 +8,6 @@ plus sign, stays as it is, since otherwise an empty answer would count as correc
 from __future__ import annotations
 
 import re
-from collections import Counter
 from collections.abc import Sequence
 from functools import lru_cache
 
@@ -81,7 +80,10 @@ def reference(answers: Sequence[str]) -> str:
     if len(answers) == 1:  # as in all 48,000 of easy-VQA
         return answers[0]
     forms = [normalise(answer) for answer in answers]
-    commonest = Counter(forms).most_common(1)[0][0]  # insertion order breaks ties
+    counts = dict.fromkeys(forms, 0)
+    for form in forms:
+        counts[form] += 1
+    commonest = max(counts, key=counts.__getitem__)  # insertion order breaks ties
     return answers[forms.index(commonest)]
 
 

@@ -15,7 +15,8 @@ from aegis_cli.data.vqa.questions import Question
 
 # The possible keys of a conversation; the first one present is used.
 KEYS = ("texts", "conversations", "messages")
-_PLACE = re.compile(r"\s*<image>\s*")  # the picture's place in a text
+_MARKER = "<image>"  # the picture's place in a text
+_PLACE = re.compile(rf"\s*{_MARKER}\s*")
 _ASKS, _ANSWERS = ("human", "user"), ("gpt", "assistant")
 _EXPECTED = (
     "turns such as {user, assistant}, {from: human, value} or {role: user, content}, each question "
@@ -25,9 +26,13 @@ _EXPECTED = (
 
 def key_of(names: Sequence[str] | Mapping[str, Any]) -> str | None:
     """The key of a row's or line's conversation; None if it asks a single question."""
-    if any(answers in names for answers in ANSWERS):
-        return None
-    return next((key for key in KEYS if key in names), None)
+    for answers in ANSWERS:
+        if answers in names:
+            return None
+    for key in KEYS:
+        if key in names:
+            return key
+    return None
 
 
 def questions(where: str, turns: Any, name: str | int, source: Any) -> list[Question]:
@@ -72,6 +77,8 @@ def one_picture(where: str, pictures: Any) -> Any:
 
 def _pairs(where: str, turns: Any) -> list[tuple[Any, Any, Any]]:
     """Question, answer and source of each turn."""
+    if (plain := _plain(turns)) is not None:
+        return plain
     if isinstance(turns, dict) and all(isinstance(column, list) for column in turns.values()):
         # Older versions of `datasets` store lists of objects as columns.
         rows = zip(*turns.values(), strict=False)
@@ -90,6 +97,26 @@ def _pairs(where: str, turns: Any) -> list[tuple[Any, Any, Any]]:
         order = ", ".join(speaker for speaker, _ in said) or "no turn"
         raise bad(where, f"a conversation of {order}", _EXPECTED, "correct the row")
     return [(ask, answer, None) for (_, ask), (_, answer) in zip(asks, answers, strict=True)]
+
+
+def _plain(turns: Any) -> list[tuple[Any, Any, Any]] | None:
+    """The same for turns of a speaker and a text, as nearly all are; None for any others."""
+    if type(turns) is not list or not turns or len(turns) % 2:
+        return None
+    said = []
+    for number, turn in enumerate(turns):
+        if type(turn) is not dict or len(turn) != 2:
+            return None
+        if "from" in turn and "value" in turn:
+            speaker, text = turn["from"], turn["value"]
+        elif "role" in turn and "content" in turn:
+            speaker, text = turn["role"], turn["content"]
+        else:
+            return None
+        if type(text) is not str or speaker not in (_ANSWERS if number % 2 else _ASKS):
+            return None
+        said.append(_text(text))
+    return [(ask, answer, None) for ask, answer in zip(said[::2], said[1::2], strict=True)]
 
 
 def _said(where: str, turn: dict[str, Any]) -> tuple[str, Any]:
@@ -115,7 +142,10 @@ def _kind(turns: Any) -> str:
 
 def _text(said: Any) -> Any:
     """A text without its image markers."""
-    return _PLACE.sub(" ", said).strip() if isinstance(said, str) else said
+    if not isinstance(said, str):
+        return said
+    # Most texts have no marker, and the pattern would try every space.
+    return (_PLACE.sub(" ", said) if _MARKER in said else said).strip()
 
 
 def _is_name(value: Any) -> bool:

@@ -38,7 +38,7 @@ def reader() -> Reader:
         raise AegisError(f"{NAME} {found}", f"version {VERSION}", fix)
     folder = Path(easy_vqa.__file__).parent / "data"
     files = tuple(folder / split / "questions.json" for split in ("train", "test"))
-    return Reader(lambda: iter(_entries()), files)
+    return Reader(lambda *_: iter(_entries()), files)
 
 
 @cache  # reading them takes seconds, and a run is probed several times

@@ -21,12 +21,17 @@ class Picture:
     Attributes:
         key: identifies the image; the same for all questions about it.
         where: the file and line that name it, for errors.
-        source: its file, or a function that reads its bytes.
+        at: the path of its file, or a function that reads its bytes.
     """
 
     key: str
     where: str
-    source: Path | Callable[[], bytes]
+    at: str | Path | Callable[[], bytes]
+
+    @property
+    def source(self) -> Path | Callable[[], bytes]:
+        """Its file, or a function that reads its bytes."""
+        return Path(self.at) if isinstance(self.at, str) else self.at
 
 
 @dataclass(frozen=True)

@@ -7,17 +7,32 @@ a question (`conversations.py`).
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import codecs
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from aegis_cli.common import files
+from aegis_cli.common import files, json_lists
 from aegis_cli.common.errors import AegisError
+from aegis_cli.common.events import OnEvent
+from aegis_cli.common.json_lists import CHUNK
 from aegis_cli.data.vqa import conversations
-from aegis_cli.data.vqa.entries import ANSWERS, Entry, Inside, Read, Reader, bad, make_question
+from aegis_cli.data.vqa.entries import (
+    ANSWERS,
+    Entry,
+    Inside,
+    OnRead,
+    Read,
+    Reader,
+    bad,
+    in_mb,
+    make_question,
+)
 from aegis_cli.data.vqa.images import Picture
 from aegis_cli.data.vqa.questions import Question
 
+_MARK = codecs.BOM_UTF8
 _LINE = 'a line such as {"image": "a.jpg", "question": "...", "answers": ["..."]}'
 
 
@@ -26,39 +41,77 @@ def reader(path: Path) -> Reader:
 
     Image paths are relative to its folder; other keys are ignored.
     """
-    read = _lines if path.suffix == ".jsonl" else _items
-    return Reader(lambda: read(path), (path,))
+    if path.suffix == ".jsonl":
+        return Reader(lambda _, on_read: _lines(path, on_read), (path,))
+    return Reader(lambda _, on_read: _items(path, on_read), (path,), partial(_check, path))
 
 
 def is_list(path: Path) -> bool:
     """Whether a JSON file begins with a list."""
     with files.reading(path, "check the path"), open(path, "rb") as file:
-        return file.read(1024).removeprefix(b"\xef\xbb\xbf").lstrip()[:1] == b"["
+        return file.read(1024).removeprefix(_MARK).lstrip()[:1] == b"["
 
 
-def _lines(path: Path) -> Iterator[Read]:
+def _lines(path: Path, on_read: OnRead) -> Iterator[Read]:
     images = Inside(path.parent)
     with files.reading(path, "check the path"), open(path, "rb") as file:
+        size = _size(path)
+        done, told = 0, 0  # bytes
         for number, line in enumerate(file, start=1):
-            if not line.strip():
+            done += len(line)
+            if done - told >= CHUNK:
+                on_read(done, size)
+                told = done
+            if line.isspace():
                 continue
             where = f"line {number} of '{path}'"
             try:
                 # Some editors write a byte-order mark at the start.
-                raw = files.parse_json(line.decode("utf-8-sig"))
+                raw = files.parse_json(line.removeprefix(_MARK).decode())
             except ValueError as error:
                 yield bad(where, f"not JSON ({error})", _LINE, "correct that line")
             else:
                 yield from _asked(where, f"line {number}", raw, images)
 
 
-def _items(path: Path) -> Iterator[Read]:
+def _items(path: Path, on_read: OnRead) -> Iterator[Read]:
     images = Inside(path.parent)
-    listed = files.load_json(path)
-    if not isinstance(listed, list):
-        raise AegisError(f"no list in '{path}'", "a list of questions", "check the path")
+    size = _size(path)
+    listed = _listed(path, lambda done: on_read(done, size))
     for number, raw in enumerate(listed, start=1):
         yield from _asked(f"item {number} of '{path}'", f"item {number}", raw, images)
+
+
+def _listed(path: Path, on_read: Callable[[int], None]) -> Iterator[Any]:
+    """The items of a list.
+
+    Raises:
+        AegisError: the file is not JSON, which may be found out after many items.
+    """
+    given = 0
+    with files.reading(path, "check the path"), open(path, "rb") as file:
+        try:
+            for item in json_lists.items(file, None, {}, on_read):
+                yield item
+                given += 1
+        except json_lists.Unusual:
+            listed = files.load_json(path)  # which raises the error, if there is one
+            if not isinstance(listed, list):
+                raise AegisError(
+                    f"no list in '{path}'", "a list of questions", "check the path"
+                ) from None
+            yield from listed[given:]
+
+
+def _check(path: Path, on_event: OnEvent) -> None:
+    """Raise AegisError unless the whole file is JSON."""
+    for _ in _listed(path, in_mb("check the file", _size(path), on_event)):
+        pass
+
+
+def _size(path: Path) -> int:
+    with files.reading(path, "check the path"):
+        return path.stat().st_size
 
 
 def _asked(where: str, place: str, raw: Any, images: Inside) -> Iterator[Read]:
@@ -75,27 +128,28 @@ def _asked(where: str, place: str, raw: Any, images: Inside) -> Iterator[Read]:
                 "an object with image, question and answers",
                 "correct that line",
             )
-        _check_keys(where, raw)
+        key = conversations.key_of(raw)
+        _check_keys(where, raw, key)
         picture = _picture(where, raw, images)
         name = raw.get("id")
-        for question in _questions(where, raw, place if name is None else name):
+        for question in _questions(where, raw, key, place if name is None else name):
             yield Entry(where, question, picture)
     except AegisError as error:
         yield error
 
 
-def _questions(where: str, raw: dict[str, Any], name: Any) -> list[Question]:
-    """The line's single question, or those of its conversation."""
-    if (key := conversations.key_of(raw)) is not None:
+def _questions(where: str, raw: dict[str, Any], key: str | None, name: Any) -> list[Question]:
+    """The line's single question, or those of the conversation under `key`."""
+    if key is not None:
         return conversations.questions(where, raw[key], name, raw.get("source"))
     answers = next(key for key in ANSWERS if key in raw)
     return [make_question(where, raw["question"], raw[answers], name, "all")]
 
 
-def _check_keys(where: str, raw: dict[str, Any]) -> None:
+def _check_keys(where: str, raw: dict[str, Any], key: str | None) -> None:
     """Raise AegisError unless there are an image and a question with answers or a conversation."""
     needed = ["image"]
-    if conversations.key_of(raw) is None:
+    if key is None:
         needed += ["question", next((key for key in ANSWERS if key in raw), ANSWERS[0])]
     present = {"image"} if "images" in raw else set()
     missing = [key for key in needed if key not in raw and key not in present]
@@ -115,6 +169,6 @@ def _picture(where: str, raw: dict[str, Any], images: Inside) -> Picture:
         raise bad(
             where, f"image {shown!r}", "a path relative to the file's folder", "correct the path"
         )
-    path = images.find(where, shown)
+    found = images.find(where, shown)
     # By its resolved name: two spellings of one image must not put it into two parts.
-    return Picture(images.name(path), where, path)
+    return Picture(found.name, where, found.path)

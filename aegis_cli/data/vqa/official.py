@@ -7,17 +7,31 @@ folder.
 
 from __future__ import annotations
 
+import contextlib
 import os
-from collections.abc import Iterator
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, TypeVar
 
-from aegis_cli.common import files
+from aegis_cli.common import files, json_lists
 from aegis_cli.common.errors import AegisError
-from aegis_cli.data.vqa.entries import Entry, Read, Reader, bad, make_question
+from aegis_cli.common.events import OnEvent
+from aegis_cli.data.vqa.entries import (
+    Entry,
+    OnRead,
+    Read,
+    Reader,
+    bad,
+    in_mb,
+    make_question,
+)
 from aegis_cli.data.vqa.images import Picture
 
 SUFFIX = "questions.json"
+Taken = TypeVar("Taken")
+_EVERY = 10_000  # questions between two reports of progress
 
 
 def reader(path: Path) -> Reader:
@@ -36,7 +50,7 @@ def reader(path: Path) -> Reader:
             f"the annotations of '{path.name}' beside it, under their official name",
             "put both files into one folder",
         )
-    return Reader(lambda: _read(path, annotations), (path, annotations))
+    return Reader(partial(_read, path, annotations), (path, annotations))
 
 
 def misnamed(path: Path) -> AegisError:
@@ -49,25 +63,25 @@ def misnamed(path: Path) -> AegisError:
     )
 
 
-def _read(path: Path, annotations: Path) -> Iterator[Read]:
+class _Annotation(NamedTuple):
+    """What is read of an annotation."""
+
+    image_id: Any
+    answers: Any
+    kind: Any
+
+
+def _read(path: Path, annotations: Path, on_event: OnEvent, on_read: OnRead) -> Iterator[Read]:
     """Each question with its annotation, then an error for each annotation without a question."""
-    whole = _load(path)
-    questions = _rows(path, whole, "questions")
-    images = _Images(path, whole.get("data_subtype"))
-    told: dict[Any, Any] = {}  # annotations by question; `_entry` removes those it uses
-    for number, row in enumerate(_rows(annotations, _load(annotations), "annotations"), start=1):
-        name = _id(row)
-        if name is not None and name not in told:
-            told[name] = row
-            continue
-        found = _no_id(row) if name is None else f"a second annotation of question {name}"
-        yield bad(
-            f"annotation {number} of '{annotations}'",
-            found,
-            "one annotation per question",
-            "correct the file",
-        )
+    about: dict[str, Any] = {}
+    questions = _taken(path, "questions", list, on_event, about)
+    images = _Images(path, about.get("data_subtype"))
+    # A file that is no JSON is refused for that, which its end may tell.
+    told, problems = _taken(annotations, "annotations", partial(_told, annotations), on_event, {})
+    yield from problems
     for number, row in enumerate(questions, start=1):
+        if number % _EVERY == 0:
+            on_read(number, len(questions))
         try:
             yield _entry(f"question {number} of '{path}'", row, told, annotations, images)
         except AegisError as error:
@@ -81,7 +95,69 @@ def _read(path: Path, annotations: Path) -> Iterator[Read]:
         )
 
 
-def _entry(where: str, row: Any, told: dict[Any, Any], annotations: Path, images: _Images) -> Entry:
+def _taken(
+    path: Path,
+    key: str,
+    take: Callable[[Iterable[Any]], Taken],
+    on_event: OnEvent,
+    about: dict[str, Any],
+) -> Taken:
+    """What is taken of the rows that an official file has under a key.
+
+    Args:
+        take: called with the rows; if they turn out to be unusual, again with all of them.
+        about: filled with the file's other values.
+    """
+    with files.reading(path, "check the path"), open(path, "rb") as file:
+        on_read = in_mb(f"read {key}", path.stat().st_size, on_event)
+        try:
+            return take(json_lists.items(file, key, about, on_read))
+        except json_lists.Unusual:
+            pass
+    whole = _load(path)
+    about |= whole
+    return take(_rows(path, whole, key))
+
+
+def _told(
+    annotations: Path, rows: Iterable[Any]
+) -> tuple[dict[str | int, _Annotation], list[AegisError]]:
+    """The annotations by question, and an error for each that has no question or a known one."""
+    told: dict[str | int, _Annotation] = {}
+    problems = []
+    for number, row in enumerate(rows, start=1):
+        name = _id(row)
+        if name is not None and name not in told:
+            told[name] = _slim(row)
+            continue
+        found = _no_id(row) if name is None else f"a second annotation of question {name}"
+        problems.append(
+            bad(
+                f"annotation {number} of '{annotations}'",
+                found,
+                "one annotation per question",
+                "correct the file",
+            )
+        )
+    return told, problems
+
+
+def _slim(row: dict[str, Any]) -> _Annotation:
+    """An annotation in little memory: its answers are a few words that occur a million times."""
+    answers: Any = row.get("answers")
+    if type(answers) is list:
+        with contextlib.suppress(KeyError, TypeError):  # other forms stay as they are
+            answers = [sys.intern(each["answer"]) for each in answers]
+    return _Annotation(row.get("image_id"), answers, row.get("answer_type"))
+
+
+def _entry(
+    where: str,
+    row: Any,
+    told: dict[str | int, _Annotation],
+    annotations: Path,
+    images: _Images,
+) -> Entry:
     """One question; its annotation is removed from `told`."""
     name = _id(row)
     if name is None:
@@ -101,18 +177,18 @@ def _entry(where: str, row: Any, told: dict[Any, Any], annotations: Path, images
             "one annotation per question",
             "take both files of one release",
         )
-    if row.get("image_id") != annotation.get("image_id"):
-        image, other = row.get("image_id"), annotation.get("image_id")
+    image, other = row.get("image_id"), annotation.image_id
+    if image != other:
         raise bad(
             where,
             f"image_id {image}, and {other} in its annotation",
             "the same image in both files",
             "take both files of one release",
         )
-    answers, kind = annotation.get("answers"), annotation.get("answer_type")
+    kind = annotation.kind
     family = kind if isinstance(kind, str) and kind else "all"
-    question = make_question(where, row.get("question"), answers, name, family)
-    return Entry(where, question, images.picture(where, row.get("image_id")))
+    question = make_question(where, row.get("question"), annotation.answers, name, family)
+    return Entry(where, question, images.picture(where, image))
 
 
 def _id(row: Any) -> str | int | None:
@@ -138,7 +214,7 @@ class _Images:
                 "take the official file, or write a .jsonl file of your own",
             )
         self.part, self._folders = part, (questions.parent / part, questions.parent)
-        self._found: dict[int, Path] = {}
+        self._found: dict[int, str] = {}
 
     def picture(self, where: str, number: Any) -> Picture:
         """The image of this number.
@@ -150,7 +226,7 @@ class _Images:
             raise bad(where, f"image_id {number!r}", "a whole number", "correct the file")
         name = f"COCO_{self.part}_{number:012d}.jpg"
         if number not in self._found:  # several questions share an image
-            places = [folder / name for folder in self._folders]
+            places = [os.path.join(folder, name) for folder in self._folders]
             path = next((place for place in places if os.path.isfile(place)), None)
             if path is None:
                 raise bad(

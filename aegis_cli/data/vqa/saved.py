@@ -13,17 +13,34 @@ import logging
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path, PurePath
 from typing import Any, TypeVar
 
 from aegis_cli.common.errors import AegisError
+from aegis_cli.common.events import OnEvent, Progress, ignore
 from aegis_cli.common.files import refuse_special, sha256_file
+from aegis_cli.common.json_lists import CHUNK
 from aegis_cli.data.vqa import conversations
-from aegis_cli.data.vqa.entries import ANSWERS, Entry, Inside, Read, Reader, bad, make_question
+from aegis_cli.data.vqa.entries import (
+    ANSWERS,
+    Entry,
+    Inside,
+    OnRead,
+    Read,
+    Reader,
+    bad,
+    make_question,
+)
 from aegis_cli.data.vqa.images import Picture
 from aegis_cli.data.vqa.questions import Question
 
 _NAMES = ("question_id", "id")
+_USED = {
+    *(*_NAMES, "question", *ANSWERS, *conversations.KEYS),
+    *("image_id", "answer_type", "source"),
+}
+_BATCH = 1000  # rows that are taken at a time; a multiple of the ten that `datasets` takes
 # Files that save_to_disk writes for one split, and for several.
 _SAVED, _SPLITS = "state.json", "dataset_dict.json"
 Stem = TypeVar("Stem", bound=PurePath)
@@ -60,7 +77,7 @@ def reader(path: Path, split: str | None = None) -> Reader:
     # `datasets` would wait forever for a pipe.
     for file in (*files, *path.glob("*.json")):
         refuse_special(file)
-    return Reader(lambda: _read(path, tuple(files)), tuple(files))
+    return Reader(partial(_read, path, tuple(files)), tuple(files))
 
 
 def _folder_of_split(path: Path, split: str | None) -> Path:
@@ -132,29 +149,37 @@ def _no_split(where: str | Path, split: str, splits: Sequence[str]) -> AegisErro
     return AegisError(found, f"one of {', '.join(splits)}", f"--vqa '{where}#{splits[-1]}'")
 
 
-def _read(path: Path, files: tuple[Path, ...]) -> Iterator[Read]:
+def _read(
+    path: Path, files: tuple[Path, ...], on_event: OnEvent, on_read: OnRead
+) -> Iterator[Read]:
+    is_large = sum(file.stat().st_size for file in files if file.exists()) > CHUNK
+    tell = on_event if is_large else ignore
+    tell(Progress("open", 0, 1, "data set"))  # `datasets` first converts parquet files, in minutes
     rows = _open(path, files)
+    tell(Progress("open", 1, 1, "data set"))
     columns = rows.column_names
     _check_columns(path, columns)
     stored = _Stored(path, files, rows)
     name = next((c for c in _NAMES if c in columns), None)
     folder = Inside(path if path.is_dir() else path.parent)
+    told = rows.select_columns([c for c in columns if c in _USED])
     outside = _outside(rows)
-    told = rows.remove_columns(_pictures(columns))
-    for number, row in enumerate(_each(told, path)):
+    for number, row in enumerate(_each(told, path, on_read)):
         where = f"row {number} of '{path}'"
         try:
-            apart = outside[number]
+            apart = next(outside)
             if isinstance(apart, int):  # raises
                 conversations.one_picture(where, [None] * apart)
-            file = folder.find(where, apart) if isinstance(apart, str) and apart else None
-            source = file or _InRow(stored, number, where)
+            at: str | _InRow = _InRow(stored, number)
+            if isinstance(apart, str) and apart:
+                at = folder.find(where, apart).path
             image_id = row.get("image_id")
             # Rows repeat images: equal bytes are one image, which belongs to one part. If it has an
             # id, no image has to be read to know that.
-            key = _digest(source) if image_id is None else f"image {image_id}"
+            key = _digest(at) if image_id is None else f"image {image_id}"
+            picture = Picture(key, where, at)
             for question in _questions(where, row, number if name is None else row[name]):
-                yield Entry(where, question, Picture(key, where, source))
+                yield Entry(where, question, picture)
         except AegisError as error:
             yield error
 
@@ -224,17 +249,27 @@ def _is_listed(rows: Any, column: str) -> bool:
     return listed
 
 
-def _each(rows: Any, path: Path) -> Iterator[dict[str, Any]]:
+def _each(rows: Any, path: Path, on_read: OnRead) -> Iterator[dict[str, Any]]:
     """The rows one by one; a damaged file may have fewer than it claims."""
-    remaining = iter(rows)
+    given = 0
+    batches = rows.iter(batch_size=_BATCH)  # many times faster than one by one
     while True:
         try:
-            row = next(remaining)
+            batch = next(batches)
         except StopIteration:
             return
-        except Exception as error:
-            raise _unreadable(path, error) from error
-        yield row
+        except Exception:  # its first rows may be whole
+            break
+        for values in zip(*batch.values(), strict=True):
+            yield dict(zip(batch, values, strict=True))
+            given += 1
+        on_read(given, len(rows))
+    try:
+        remaining = iter(rows.select(range(given, len(rows))))
+        while (row := next(remaining, None)) is not None:
+            yield row
+    except Exception as error:
+        raise _unreadable(path, error) from error
 
 
 def _unreadable(path: Path, error: Exception) -> AegisError:
@@ -244,20 +279,26 @@ def _unreadable(path: Path, error: Exception) -> AegisError:
     return AegisError(f"'{path}' cannot be read ({why})", expected, "download it again")
 
 
-def _outside(rows: Any) -> list[str | int | None]:
+def _outside(rows: Any) -> Iterator[str | int | None]:
     """The path of each row's image if it is not stored in the row; no image is read for this.
 
     A number is the count of images in a row that does not have exactly one.
     """
-    import pyarrow as pa
+    column = _pictures(rows.column_names)
+    listed = _is_listed(rows, column)
+    for images in rows.data.column(column).iterchunks():
+        for first in range(0, len(images), _BATCH):
+            yield from _outside_of(images.slice(first, _BATCH), listed)
+
+
+def _outside_of(images: Any, listed: bool) -> Sequence[str | int | None]:
+    """The same for some of the rows."""
     import pyarrow.compute as pc
 
-    column = _pictures(rows.column_names)
-    images = rows.data.column(column)
     counts = None
-    if _is_listed(rows, column):
+    if listed:
         counts = pc.fill_null(pc.list_value_length(images), 0)
-        images = pa.chunked_array([pc.list_flatten(images)])
+        images = pc.list_flatten(images)
     stored, paths = pc.struct_field(images, "bytes"), pc.struct_field(images, "path")
     size = pc.fill_null(pc.binary_length(stored), 0)
     # If a row has both, the path is only where the image was on its author's disk.
@@ -286,13 +327,16 @@ class _Stored:
         self.rows = _open(self.path, self.files)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class _InRow:
     """Reads the bytes of an image that is stored in its row."""
 
     stored: _Stored
     number: int
-    where: str
+
+    @property
+    def where(self) -> str:
+        return f"row {self.number} of '{self.stored.path}'"
 
     def __call__(self) -> bytes:
         rows = self.stored.rows
@@ -304,6 +348,6 @@ class _InRow:
         return bytes(image["bytes"])
 
 
-def _digest(source: Path | Callable[[], bytes]) -> str:
+def _digest(at: str | Callable[[], bytes]) -> str:
     """sha256 of an image's bytes, from a file or a function."""
-    return sha256_file(source) if isinstance(source, Path) else hashlib.sha256(source()).hexdigest()
+    return sha256_file(at) if isinstance(at, str) else hashlib.sha256(at()).hexdigest()

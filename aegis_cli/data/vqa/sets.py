@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import chain
 from pathlib import Path
@@ -21,13 +22,16 @@ from aegis_cli.common import hub
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Progress, Warned, ignore
 from aegis_cli.common.files import sha256_file, sha256_value
+from aegis_cli.common.processes import worker_count
 from aegis_cli.data.vqa import download, easy, equal_files, jsonl, official, saved
 from aegis_cli.data.vqa.dataset import VQASet, digest_of, load_scenes
-from aegis_cli.data.vqa.entries import OR_SKIP, Entry, Reader, unique
+from aegis_cli.data.vqa.entries import OR_SKIP, Entry, Reader
 from aegis_cli.data.vqa.images import Picture, Pictures, decode
+from aegis_cli.data.vqa.packed import Entries, Ids
 
 SCENES = "scenes"
 PLAIN = "{}"  # the question is asked as it is
+_AT_ONCE = 1024  # images between two reports of progress
 # Of ten images in files, four are for anchors and co-training, one is for tuning studies, and five
 # are for probes.
 PARTS: dict[str, range] = {
@@ -93,18 +97,20 @@ class Listed:
     Attributes:
         name: the file's or folder's name.
         files: the files that hold the questions.
-        entries: the valid questions.
+        entries: the valid questions, packed.
         skip_bad: whether bad questions are left out instead of raising an error.
         problems: the errors of the questions left out.
         ask: the template of a question's prompt, with {} for the question.
+        on_event: hears how many images `state` has read.
     """
 
     name: str
     files: tuple[Path, ...]
-    entries: tuple[Entry, ...]
+    entries: Entries
     skip_bad: bool
     problems: tuple[AegisError, ...] = ()
     ask: str = PLAIN
+    on_event: OnEvent = field(default=ignore, repr=False, compare=False)
 
     @property
     def skipped(self) -> int:
@@ -128,16 +134,13 @@ class Listed:
         Raises:
             AegisError: no question is usable, or, without `skip_bad`, a check refuses one.
         """
-        by_image: dict[str, list[Entry]] = {}
-        for entry in self.entries:
-            by_image.setdefault(entry.picture.key, []).append(entry)
-        mine = [key for key in by_image if self.holds(part, key)]
+        mine = [key for key in self.entries.images if self.holds(part, key)]
         mine.sort(key=lambda key: digest_of(f"{seed} {key}"))
-        most = min(questions, sum(len(by_image[key]) for key in mine))
+        most = min(questions, sum(map(self.entries.count, mine)))
         kept: list[list[Entry]] = []
         count, skipped = 0, self.skipped
         for key in mine:
-            wanted = by_image[key][: questions - count]
+            wanted = self.entries.about(key, questions - count)
             # Only the needed ones are checked: decoding every image would take hours.
             sound = self._sound(wanted, checks)
             skipped += len(wanted) - len(sound)
@@ -148,7 +151,7 @@ class Listed:
             if count == questions:
                 break
         if not kept:
-            raise self._nothing(part, len(by_image), skipped)
+            raise self._nothing(part, len(self.entries.images), skipped)
         if count < questions:  # some were left out, so the progress has not reached 100 %
             on_event(Progress("questions", count, count, "questions"))
         self._warn_of_shared(part, [own[0].picture for own in kept], on_event)
@@ -161,8 +164,8 @@ class Listed:
     def _warn_of_shared(self, part: str, chosen: Sequence[Picture], on_event: OnEvent) -> None:
         """Warn of held-out images that are in an earlier part under another name."""
         earlier = _EARLIER[part]
-        others = {e.picture.key: e.picture for e in self.entries} if earlier else {}
-        learned = [p for key, p in others.items() if any(self.holds(of, key) for of in earlier)]
+        known = [k for k in self.entries.images if any(self.holds(of, k) for of in earlier)]
+        learned = [self.entries.picture(key) for key in known]
         if found := equal_files.shared(chosen, learned, on_event):
             (one, other), *_ = found
             text = (
@@ -227,15 +230,17 @@ class Listed:
         It holds digests of the question files and of the image files. File times would change when
         a folder is copied, and everything would be trained again.
         """
-        images = {entry.picture.key: entry.picture.source for entry in self.entries}
         # Images stored in rows are part of the question files, whose digests are included anyway.
+        sources = {key: self.entries.picture(key).source for key in self.entries.images}
+        paths = {key: source for key, source in sources.items() if isinstance(source, Path)}
         digests: dict[str, str | None] = {}
-        for key, source in images.items():
-            if isinstance(source, Path):
-                try:
-                    digests[key] = sha256_file(source)
-                except AegisError:  # reported or left out when the image is used
-                    digests[key] = None
+        with ThreadPoolExecutor(worker_count(len(paths))) as pool:
+            keys = list(paths)
+            for first in range(0, len(keys), _AT_ONCE):
+                some = keys[first : first + _AT_ONCE]
+                digests |= zip(some, pool.map(_digest, map(paths.__getitem__, some)), strict=True)
+                if len(paths) > _AT_ONCE:
+                    self.on_event(Progress("checksums", len(digests), len(paths), "images"))
         return {"question_files": self.sha256, "image_files": sha256_value(digests)}
 
 
@@ -278,15 +283,25 @@ def read(
     if vqa == SCENES:
         return Scenes(ask=ask)
     source = easy.reader() if vqa == easy.NAME else _reader(*_located(vqa))
-    entries: list[Entry] = []
+    entries = Entries()
+    ids = Ids(entries)
     problems: list[AegisError] = []
-    for entry in unique(source.read()):
-        if isinstance(entry, Entry):
+
+    def on_read(done: int, total: int) -> None:
+        # As many in the rest as in what is read, which is known only when all of it is.
+        expected = max(round(len(entries) * total / done), len(entries) + 1)
+        on_event(Progress("read", len(entries), expected, "questions"))
+
+    for entry in source.read(on_event, on_read):
+        problem = ids.add(entry) if isinstance(entry, Entry) else entry
+        if isinstance(entry, Entry) and problem is None:
             entries.append(entry)
-        elif skip_bad:
-            problems.append(entry)
-        else:
-            raise entry
+        elif problem is not None:
+            if not skip_bad:
+                source.check(on_event)  # a set that is unusable as a whole is refused for that
+                raise problem
+            # Without what was read around it, which would stay in memory.
+            problems.append(problem.with_traceback(None))
     on_event(Progress("read", len(entries), len(entries), "questions"))
     if not entries:
         first = f": {len(problems)} are bad, the first: {problems[0].found}" if problems else ""
@@ -298,7 +313,7 @@ def read(
     kind = EasyVqa if vqa == easy.NAME else Listed
     # The set's name does not depend on the working directory: `.` becomes the folder's name.
     name = os.path.basename(os.path.abspath(vqa)).replace("#", "-")
-    return kind(name, source.files, tuple(entries), skip_bad, tuple(problems), ask)
+    return kind(name, source.files, entries, skip_bad, tuple(problems), ask, on_event)
 
 
 def _located(vqa: str) -> tuple[Path, str | None]:
@@ -365,6 +380,14 @@ def _unknown(found: str, fix: str = "check the path, or use --vqa scenes") -> Ae
         "or OK-VQA, a folder of a Hugging Face data set, or its id on the hub"
     )
     return AegisError(found, expected, fix)
+
+
+def _digest(image: Path) -> str | None:
+    """sha256 of a file; None if it cannot be read, which is reported when the image is used."""
+    try:
+        return sha256_file(image)
+    except AegisError:
+        return None
 
 
 def share(key: str) -> int:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import statistics
+from array import array
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -19,12 +20,15 @@ from aegis_cli.data.vqa import easy, sets
 from aegis_cli.data.vqa.answers import normalise
 from aegis_cli.data.vqa.entries import Entry
 from aegis_cli.data.vqa.images import decode
+from aegis_cli.data.vqa.packed import Entries
 
 ANSWERS = 10  # the most common ones listed
 PROBLEMS = 5  # the bad questions listed, with their places
 SHOWN = 6  # images on a sheet
 _PARTS = ("anchor", "validation", "probe")  # co-training uses the anchors' images
 _TILE, _TEXT = 384, 13  # pixels
+_EVERY = 20_000  # questions or images between two reports of progress
+Item = TypeVar("Item")
 
 
 @dataclass(frozen=True)
@@ -113,25 +117,35 @@ def of_set(name: str, images: bool = False, on_event: OnEvent = ignore) -> Quest
     Raises:
         AegisError: a file cannot be read, or no question is usable.
     """
-    found = _read(name)
+    found = _read(name, on_event)
     if images:
         found = _with_whole_images(found, on_event)
     entries = found.entries
-    asked = [entry.question for entry in entries]
-    distinct = {(entry.picture.key, entry.question.text) for entry in entries}
-    given = [max(len(question.answers), 1) for question in asked]
-    answers = Counter(normalise(question.answer) for question in asked)
-    families = Counter(question.family for question in asked)
+    words, answer_words = array("I"), array("I")
+    given, families, said = set[int](), Counter[str](), Counter[str]()
+    for entry in _told(entries, "count", "questions", on_event):
+        question = entry.question
+        words.append(len(question.text.split()))
+        answer_words.append(len(question.answer.split()))
+        given.add(max(len(question.answers), 1))
+        families[question.family] += 1
+        said[question.answer] += 1
+    answers = Counter[str]()
+    for answer, count in said.items():  # a few answers are given a million times
+        answers[normalise(answer)] += count
     return QuestionsReport(
         kind="questions",
         path=name,
         questions=len(entries),
-        images=len({entry.picture.key for entry in entries}),
+        images=len(entries.images),
         bad=found.skipped,
         problems=_first(found.problems),
-        repeated=len(entries) - len(distinct),
-        words=_words([question.text for question in asked]),
-        answer_words=_words([question.answer for question in asked]),
+        repeated=sum(
+            _repeated(entries, key)
+            for key in _told(entries.images, "compare questions", "images", on_event)
+        ),
+        words=_words(words),
+        answer_words=_words(answer_words),
         answers_a_question={"least": min(given), "most": max(given)},
         parts=tuple(_part(found, part) for part in _PARTS),
         families=tuple(Family(*each) for each in families.most_common()),
@@ -143,19 +157,31 @@ def of_set(name: str, images: bool = False, on_event: OnEvent = ignore) -> Quest
     )
 
 
-def save_sheet(name: str, out: Path) -> None:
+def _told(items: Sequence[Item], stage: str, unit: str, on_event: OnEvent) -> Iterator[Item]:
+    """The items; of many it is told how many are done."""
+    for done, item in enumerate(items, start=1):
+        yield item
+        if len(items) >= _EVERY and (done % _EVERY == 0 or done == len(items)):
+            on_event(Progress(stage, done, len(items), unit))
+
+
+def _repeated(entries: Entries, key: str) -> int:
+    """How many questions about an image repeat an earlier one about it."""
+    texts = [entry.question.text for entry in entries.about(key)]
+    return len(texts) - len(set(texts))
+
+
+def save_sheet(name: str, out: Path, on_event: OnEvent = ignore) -> None:
     """Write a PNG with some images of a set, each with a question and its answer.
 
     Raises:
         AegisError: a set or an image cannot be read, or the path cannot be written.
     """
     media.check_sheet(out)
-    first: dict[str, Entry] = {}
-    for entry in _read(name).entries:
-        first.setdefault(entry.picture.key, entry)
-    spread = np.linspace(0, len(first) - 1, SHOWN).round().astype(int)
+    entries = _read(name, on_event).entries
+    spread = np.linspace(0, len(entries.images) - 1, SHOWN).round().astype(int)
     # If there are fewer images than places, some are found several times.
-    shown = [list(first.values())[number] for number in np.unique(spread)]
+    shown = [entries.about(entries.images[number], 1)[0] for number in np.unique(spread)]
     cells = [(_caption(entry), [decode(entry.picture, None)]) for entry in shown]
     sheet = media.tiled(cells, columns=3, tile=_TILE, text=_TEXT)
     files.write_atomically(out, lambda file: sheet.save(file, format="PNG"))
@@ -165,9 +191,8 @@ def _caption(entry: Entry) -> str:
     return f"{entry.question.text}  {entry.question.answer}"
 
 
-def _words(texts: Sequence[str]) -> dict[str, float]:
-    """Median and maximum number of words per text."""
-    counts = [len(text.split()) for text in texts]
+def _words(counts: Sequence[int]) -> dict[str, float]:
+    """Median and maximum of the numbers of words of texts."""
     return {"median": statistics.median(counts), "most": max(counts)}
 
 
@@ -178,7 +203,8 @@ def _first(problems: Sequence[AegisError]) -> tuple[str, ...]:
 
 def _with_whole_images(found: sets.Listed, on_event: OnEvent) -> sets.Listed:
     """The set without questions about undecodable images, which become problems."""
-    pictures = {entry.picture.key: entry.picture for entry in found.entries}
+    entries = found.entries
+    pictures = {key: entries.picture(key) for key in entries.images}
     broken: dict[str, AegisError] = {}
     for number, (key, picture) in enumerate(pictures.items(), start=1):
         try:
@@ -186,8 +212,10 @@ def _with_whole_images(found: sets.Listed, on_event: OnEvent) -> sets.Listed:
         except AegisError as error:  # reported with the other problems
             broken[key] = error
         on_event(Progress("images", number, len(pictures), "images"))
-    sound = tuple(entry for entry in found.entries if entry.picture.key not in broken)
-    lost = [broken[e.picture.key] for e in found.entries if e.picture.key in broken]
+    if not broken:
+        return found
+    sound = Entries(entry for entry in entries if entry.picture.key not in broken)
+    lost = [broken[e.picture.key] for e in entries if e.picture.key in broken]
     if not sound:
         raise AegisError(
             f"no image of '{found.name}' can be decoded, the first: {lost[0].found}",
@@ -197,9 +225,9 @@ def _with_whole_images(found: sets.Listed, on_event: OnEvent) -> sets.Listed:
     return dataclasses.replace(found, entries=sound, problems=(*found.problems, *lost))
 
 
-def _read(name: str) -> sets.Listed:
+def _read(name: str, on_event: OnEvent) -> sets.Listed:
     try:
-        found = sets.read(name, skip_bad=True)
+        found = sets.read(name, skip_bad=True, on_event=on_event)
     except AegisError as error:
         known = "aegis inspect takes .jsonl and .parquet files, and lists in .json, for questions"
         if not Path(name).exists() and hub.is_id(name):
@@ -211,5 +239,5 @@ def _read(name: str) -> sets.Listed:
 
 
 def _part(found: sets.Listed, name: str) -> Part:
-    mine = [entry for entry in found.entries if found.holds(name, entry.picture.key)]
-    return Part(name, len(mine), len({entry.picture.key for entry in mine}))
+    mine = [key for key in found.entries.images if found.holds(name, key)]
+    return Part(name, sum(map(found.entries.count, mine)), len(mine))
