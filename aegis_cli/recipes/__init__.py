@@ -43,6 +43,7 @@ from aegis_cli.recipes.policy import (
 )
 from aegis_cli.recipes.pretraining import DualRecipe, Model, PretrainRecipe, Towers
 from aegis_cli.recipes.reader import (
+    adjustable,
     digest,
     drawn,
     earlier_training_part,
@@ -159,6 +160,7 @@ __all__ = [
     "VALIDATION",
     "Variant",
     "WEIGHTINGS",
+    "adjustable",
     "anchor_checks",
     "changed",
     "check_run",

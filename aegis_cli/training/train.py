@@ -39,7 +39,7 @@ from aegis_cli.data.selection import Paths
 from aegis_cli.data.vqa.metrics import Graded
 from aegis_cli.methods.base import Parts
 from aegis_cli.methods.known_parameters import check_row
-from aegis_cli.models import flow
+from aegis_cli.models import flow, structure
 from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.models.buffers import WrittenBuffers
 from aegis_cli.models.policy import Policy
@@ -64,6 +64,7 @@ from aegis_cli.training.validation_vqa import ToldOfSet, ValidationQuestions
 
 LEDGER = "ledger.safetensors"
 INTERRUPTED = "interrupted"  # in a training state's header: the sums since the last line of metrics
+UNLOGGED = "unlogged"  # in such a header: true if no line of metrics had been written yet
 VALIDATION_FRAMES = 512
 # A validation reports its own progress if training steps on as many batches would take longer than
 # this; questions do if their answers took longer before training, and episodes and predicted
@@ -153,9 +154,11 @@ def run(
         if ranks.first:
             longer.check(out, recipe, resume, overwrite, places, on_event)
         goes_on = ranks.agree(ranks.first and not overwrite and checkpoint.begun(out))
+        is_finished = goes_on and _has_ended(out, recipe)
+        if is_finished:  # no step is left that would be taken in another way
+            recipe = folder.as_begun(out, recipe)
         with loading_told("train", on_event):
             training = assemble.build(recipe, chosen, demos, anchor, out, on_event, ranks)
-        is_finished = goes_on and _has_ended(out, recipe)
         if not is_finished:
             training.episodes = validation_rollout.chosen(
                 recipe, training.shown, training.meta, ranks
@@ -171,6 +174,8 @@ def run(
                 on_event(Progress("train (up to date)", 1, 1, "stage"))
             else:
                 _warn_of_another_precision(training, on_event)
+                _check_passes(training)
+                _tell_of_adjustments(training, on_event)
             if ranks.first:
                 if _says_otherwise(out, recipe, places):
                     folder.write_recipe(out, recipe)
@@ -240,6 +245,30 @@ def _warn_of_another_precision(run: TrainingRun, on_event: OnEvent) -> None:
             f"'{run.out}' began with matrix products in {begun} ({machine.NAME}), and goes on in "
             f"{now}, which is what train.precision: {run.recipe.train.precision} means on this "
             "machine: its weights will match neither"
+        )
+        on_event(Warned("train", text))
+
+
+def _check_passes(run: TrainingRun) -> None:
+    """Refuse another number of passes per step where batch normalisation reads those of a pass."""
+    begun, now = folder.as_begun(run.out, run.recipe).train.accumulate, run.recipe.train.accumulate
+    if begun != now and structure.averaging(run.policy.backbone):
+        raise AegisError(
+            f"train.accumulate: {now} for the run in '{run.out}', which began with {begun}, and "
+            "whose backbone normalises over the frames of a pass",
+            "as many passes as it began with",
+            f"go on with its own: {commands.aegis('train', run.out)}",
+        )
+
+
+def _tell_of_adjustments(run: TrainingRun, on_event: OnEvent) -> None:
+    """Say which settings a resumed run takes that it did not have so far."""
+    changes = folder.adjustments(run.out, run.recipe)
+    if changes:
+        text = (
+            f"'{run.out}' goes on with {changes}. This changes memory, time or what is written, "
+            "and what is learned at most by rounding; files may differ from those of an "
+            "uninterrupted run"
         )
         on_event(Warned("train", text))
 
@@ -384,6 +413,7 @@ def _check_behind(
     method = meta.get("method")
     rows = kept.tensors["step"][:done].tolist()
     settings = run.recipe.train
+    log_every = folder.as_begun(run.out, run.recipe).train.log_every  # may change from here on
     # Steps in which the backbone is frozen have no row.
     moving = moving_steps(settings.steps, settings.backbone_until)
     moved = min(done, moving)
@@ -396,7 +426,7 @@ def _check_behind(
         problem = f"the {LEDGER} of another run"
     elif rows != wanted or [kept.header.meta.get(k) for k in ("groups", "layers")] != columns:
         problem = f"a {LEDGER} without exactly the steps 1 to {moved} before its end"
-    elif not lines and done >= settings.log_every:
+    elif not lines and done >= log_every and meta.get(UNLOGGED) is not True:
         problem = f"an empty {folder.METRICS} after {done} steps"
     elif done < moving and run.parts.reuses(done) and not run.reused:
         problem = f"a checkpoint of step {done} without the anchor gradient that the next reuses"
@@ -548,7 +578,13 @@ def _save_interrupted(run: TrainingRun, finished: int, window: Window) -> None:
     """Write the checkpoint that a run is resumed from after a signal."""
     with _good_steps_saved(run):
         read_figures(run, window)
-    _save(run, finished, {INTERRUPTED: dataclasses.asdict(window)})
+    _save(run, finished, {INTERRUPTED: dataclasses.asdict(window), **_unlogged(run)})
+
+
+def _unlogged(run: TrainingRun) -> dict[str, bool]:
+    """What a checkpoint that no line of metrics belongs to says, if there is no line at all."""
+    is_logged = not run.ranks.first or bool(folder.read_metrics(run.out))  # the first one writes
+    return {} if is_logged else {UNLOGGED: True}
 
 
 @contextmanager
@@ -637,7 +673,7 @@ def _good_steps_saved(run: TrainingRun) -> Generator[None]:
         yield
     except Diverged as end:
         good = end.good_steps
-        _save(run, good)
+        _save(run, good, _unlogged(run))
         steps = "1 good step is" if good == 1 else f"{good} good steps are"
         kept = f"the {steps} in {run.out}/checkpoints/last; {end.fix}"
         raise Diverged(end.found, end.expected, kept, good) from None
