@@ -36,6 +36,7 @@ from aegis_cli.core.ledger import Ledger, conflict_share, energy_shed_mean
 from aegis_cli.data import augment, demonstrations, mixture, spread
 from aegis_cli.data.batch import RobotBatch
 from aegis_cli.data.selection import Paths
+from aegis_cli.data.vqa.gate import UPPER
 from aegis_cli.data.vqa.metrics import Graded
 from aegis_cli.methods.base import Parts
 from aegis_cli.methods.known_parameters import check_row
@@ -52,6 +53,7 @@ from aegis_cli.training import (
     inputs,
     longer,
     parallel,
+    retention,
     step,
     track,
     validation_actions,
@@ -519,6 +521,8 @@ def _train(run: TrainingRun, done: int, window: Window, on_event: OnEvent) -> Tr
             if _heeds(run, due) and run.ranks.any(signaled.number is not None)[0]:
                 _save_interrupted(run, finished, window)
                 signaled.leave()
+    if done < settings.steps:
+        _tell_of_no_checkpoint_within(run, on_event)
     return run.ranks.by_first(lambda: _report(run))
 
 
@@ -967,17 +971,32 @@ def _watched(run: TrainingRun, finished: int, hearing: _Hearing) -> dict[str, fl
 
 
 def _warn_of_drop(run: TrainingRun, line: Mapping[str, float], on_event: OnEvent) -> None:
-    """Warn the first time that the drop exceeds what the recipe's gate allows."""
-    past = validation_vqa.past_limit(run.recipe, validation_vqa.of_line(run.recipe, line))
-    if not past or run.told_of_drop:
+    """Warn the first time that the drop, or only its interval, exceeds what the gate allows."""
+    recipe = run.recipe
+    past = validation_vqa.past_limit(recipe, validation_vqa.of_line(recipe, line))
+    if not past or not run.learns_vlm:  # a frozen VLM has lost nothing, however few its questions
         return
-    run.told_of_drop = True
-    name, told = next(iter(past.items()))
-    low, high = told["drop_interval"]
+    is_lost = any(validation_vqa.is_lost(recipe, told) for told in past.values())
+    if run.told_of_drop or (run.told_of_few and not is_lost):
+        return
+    run.told_of_drop, run.told_of_few = is_lost, True
+    on_event(Warned("train", validation_vqa.of_past_limit(recipe, int(line["step"]), past)))
+
+
+def _tell_of_no_checkpoint_within(run: TrainingRun, on_event: OnEvent) -> None:
+    """Say at the end of a training if no checkpoint that is kept is known to pass the gate."""
+    if run.recipe.train.keep_checkpoints is None or not run.learns_vlm or not run.ranks.first:
+        return
+    steps = [int(path.name) for path in checkpoint.whole(run.out)]
+    best = retention.best(run.out, steps, run.recipe)
+    if best.passes is not False:
+        return
+    probe = run.recipe.probe
+    by = " by the upper end of its interval (probe.gate)" if probe.gate == UPPER else ""
     text = (
-        f"after step {line['step']} {told['drop_points']:.2f} points of VQA are lost ({low:.2f} to "
-        f"{high:.2f}) on validation questions of '{name}', where probe.max_drop allows "
-        f"{run.recipe.probe.max_drop:g}"
+        f"no checkpoint is known to have lost at most {probe.max_drop:g} points of VQA{by}, which "
+        f"probe.max_drop allows: the one kept as the best, of step {best.step}, has the lowest "
+        "validation loss"
     )
     on_event(Warned("train", text))
 
