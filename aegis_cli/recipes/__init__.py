@@ -58,9 +58,11 @@ from aegis_cli.recipes.reader import (
     options,
     read,
     read_anchor,
+    retired,
     selected,
     to_yaml,
     training_part,
+    without_retired,
 )
 from aegis_cli.recipes.streams import (
     LEARNERS,
@@ -183,8 +185,10 @@ __all__ = [
     "read",
     "read_anchor",
     "recorded",
+    "retired",
     "selected",
     "take_kind",
     "to_yaml",
     "training_part",
+    "without_retired",
 ]

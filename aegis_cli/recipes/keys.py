@@ -155,8 +155,9 @@ def is_retired(field: dataclasses.Field[Any]) -> bool:
 
 
 def adjusting(section: Any) -> set[str]:
-    """The keys of a section that may change when a run is resumed (`adjusts`)."""
-    return {f.name for f in dataclasses.fields(section) if f.metadata.get("adjusts")}
+    """The keys of a section that may change when a run is resumed (`adjusts`), or are retired."""
+    fields = dataclasses.fields(section)
+    return {f.name for f in fields if f.metadata.get("adjusts") or is_retired(f)}
 
 
 def is_required(field: dataclasses.Field[Any]) -> bool:

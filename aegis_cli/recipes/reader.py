@@ -156,6 +156,28 @@ def _plain(value: Any) -> Any:
     return [_plain(item) for item in value] if isinstance(value, tuple | list) else value
 
 
+def retired(kind: type = Recipe) -> frozenset[str]:
+    """The dotted keys of a recipe that no longer have an effect."""
+    found = set[str]()
+    for field in dataclasses.fields(kind):
+        if dataclasses.is_dataclass(field.default):
+            inner = dataclasses.fields(field.default)
+            found.update(f"{field.name}.{own.name}" for own in inner if is_retired(own))
+    return frozenset(found)
+
+
+def without_retired(values: Mapping[str, Any], kind: type = Recipe) -> dict[str, Any]:
+    """A recipe's values by section without those of retired keys."""
+    gone = retired(kind)
+
+    def kept(section: str, inner: Any) -> Any:
+        if not isinstance(inner, Mapping):
+            return inner
+        return {name: value for name, value in inner.items() if f"{section}.{name}" not in gone}
+
+    return {name: kept(name, inner) for name, inner in values.items()}
+
+
 def every_key(recipe: AnyRecipe) -> dict[str, Any]:
     """Every key with its value, including retired keys, as if read from a JSON file."""
     return json.loads(json.dumps(dataclasses.asdict(recipe)))  # JSON turns tuples into lists

@@ -135,7 +135,7 @@ def as_begun(out: Path, recipe: Recipe) -> Recipe:
 def adjustments(out: Path, recipe: Recipe) -> str:
     """The keys of `recipe` that change when the run is resumed with it; empty if none does."""
     there, here = as_begun(out, recipe).train, recipe.train
-    names = recipes.adjustable(recipe)
+    names = {n for n in recipes.adjustable(recipe) if f"train.{n}" not in recipes.retired()}
     seen = [{"train": {n: getattr(each, n) for n in sorted(names)}} for each in (there, here)]
     return differences(*seen)
 

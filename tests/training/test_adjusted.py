@@ -82,6 +82,15 @@ def test_passes_may_change_where_their_gradients_add_up(
             torch.testing.assert_close(found[name], wanted[name], rtol=1e-3, atol=1e-4, msg=name)
 
 
+def test_a_key_without_effect_may_change_and_nothing_is_said(
+    naive_run: Path, start: Start, recipe: Recipe, tmp_path: Path
+) -> None:
+    cut(start, "naive", tmp_path, recipe=replace(recipe, train=replace(SETTINGS, leak_every=3)))
+    told: list[Event] = []
+    start("naive", tmp_path, resume=True, on_event=told.append)
+    assert texts(told) == [] and last_bytes(tmp_path) == last_bytes(naive_run)
+
+
 @pytest.mark.parametrize("method", ["aegis", "distill", "insulate", "cotrain"])
 def test_passes_stay_where_a_method_reads_what_is_in_one(
     method: str, start: Start, recipe: Recipe, tmp_path: Path
