@@ -136,8 +136,12 @@ def adjustments(out: Path, recipe: Recipe) -> str:
     """The keys of `recipe` that change when the run is resumed with it; empty if none does."""
     there, here = as_begun(out, recipe).train, recipe.train
     names = {n for n in recipes.adjustable(recipe) if f"train.{n}" not in recipes.retired()}
-    seen = [{"train": {n: getattr(each, n) for n in sorted(names)}} for each in (there, here)]
-    return differences(*seen)
+    found = []
+    for name in sorted(names):
+        old, new = getattr(there, name), getattr(here, name)
+        if old != new:
+            found.append(f"train.{name}: {_said(new)} instead of {_said(old)}")
+    return ", ".join(found)
 
 
 def _begun(out: Path, recipe: Trained) -> Trained:

@@ -58,7 +58,7 @@ def test_what_is_written_how_often_may_change_and_no_weight_does(
     start("naive", run, recipe=other, resume=True, on_event=told.append)
     (said,) = texts(told)
     for name, value in changes.items():
-        assert f"train.{name}: {getattr(SETTINGS, name)} there, {value} here" in said
+        assert f"train.{name}: {value} instead of {getattr(SETTINGS, name)}" in said
     assert "from those of an uninterrupted run" in said
     assert recipes.load(run / "recipe.yaml").train == replace(other.train, method="naive")
     assert last_bytes(run) == last_bytes(naive_run)
@@ -74,7 +74,7 @@ def test_passes_may_change_where_their_gradients_add_up(
     other = replace(recipe, train=replace(SETTINGS, accumulate=2))
     told: list[Event] = []
     start(method, tmp_path, recipe=other, resume=True, on_event=told.append)
-    assert "train.accumulate: 1 there, 2 here" in texts(told)[0]
+    assert "train.accumulate: 2 instead of 1. This changes memory" in texts(told)[0]
     wanted = artifacts.load(checkpoint.last(whole_run(method)) / checkpoint.STATE).tensors
     found = artifacts.load(checkpoint.last(tmp_path) / checkpoint.STATE).tensors
     for name in wanted:
