@@ -170,13 +170,13 @@ def run(
             )
             training.questions = _asked_before(training, on_event)
         if goes_on:
+            _check_passes(training)
             restored = _restore(training, places)
             # If all steps have been taken, `_train` takes none and only reports.
             if is_finished:
                 on_event(Progress("train (up to date)", 1, 1, "stage"))
             else:
                 _warn_of_another_precision(training, on_event)
-                _check_passes(training)
                 _tell_of_adjustments(training, on_event)
             if ranks.first:
                 if _says_otherwise(out, recipe, places):

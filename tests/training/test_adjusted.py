@@ -117,8 +117,10 @@ def test_passes_stay_where_the_backbone_normalises_over_one(
     monkeypatch.setattr(loading.backbones, "load", with_averages)
     cut(start, "naive", tmp_path, anchor=None)
     other = replace(recipe, train=replace(SETTINGS, accumulate=2))
+    before = contents(tmp_path) | {"log": (tmp_path / folder.METRICS).read_bytes()}
     with pytest.raises(AegisError, match="normalises over the frames of a pass"):
         start("naive", tmp_path, anchor=None, recipe=other, resume=True)
+    assert contents(tmp_path) | {"log": (tmp_path / folder.METRICS).read_bytes()} == before
     start("naive", tmp_path, anchor=None, resume=True)
 
 
