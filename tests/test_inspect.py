@@ -337,6 +337,7 @@ def test_a_recipe_is_shown_with_every_key_and_read_back(path, capsys, tmp_path):
     meant, again = study_cells.load_any(path), study_cells.load_any(tmp_path / "whole.yaml")
     assert type(again) is type(meant)
     assert study_cells.written_out(again) == study_cells.written_out(meant)
+    assert "leak" not in json.dumps(study_cells.written_out(meant))  # retired keys have no effect
     if not hasattr(meant, "shared"):
         assert again == meant
     keys = study_cells.written_out(meant).get("shared", study_cells.written_out(meant))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from aegis_cli.cli import render
@@ -19,6 +19,7 @@ from aegis_cli.recipes import (
     StreamStudyRecipe,
     Train,
     options,
+    retired,
 )
 from aegis_cli.recipes.policy import CONSTANT
 from aegis_cli.recipes.study_cells import cell, places
@@ -27,6 +28,7 @@ from aegis_cli.recipes.variants import SECTIONS
 _SCENES = "scenes"
 # Keys of a training that affect only how the backbone learns.
 _OF_BACKBONE = ("train.backbone_lr", "train.backbone_until", "train.optimizer", "train.momentum")
+_USUAL = Recipe(name="usual")
 _OF_QUESTIONS = ("vqa", "skip_bad", "ask", "questions", "batch_size")
 
 
@@ -55,6 +57,9 @@ def of_run(recipe: Recipe | AnyStudy, overrides: Sequence[str] = ()) -> None:
 
     For the recipe of a job it also warns about settings; `overrides` are those of the command line.
     """
+    if isinstance(recipe, AnyStudy) and launch.rank() == 0:
+        for text in _of_retired(recipe, overrides):
+            render.note(f"warning: {text}")
     if isinstance(recipe, StreamStudyRecipe):
         return
     if isinstance(recipe, Recipe):
@@ -92,7 +97,11 @@ def of_settings(
     if launch.rank() > 0:
         return
     methods = methods or (recipe.train.method,)
-    texts = [*_of_schedule(recipe), *_of_unread(overrides, methods)]
+    texts = [
+        *_of_schedule(recipe),
+        *_of_unread(overrides, methods),
+        *_of_retired(recipe, overrides),
+    ]
     if isinstance(recipe, Recipe) and "nullspace" in methods:
         texts += _of_thresholds(recipe.nullspace)
     if isinstance(recipe, Recipe) and "insulate" in methods:
@@ -129,6 +138,23 @@ def _of_unread(overrides: Sequence[str], methods: Sequence[str]) -> Iterator[str
             yield f"--set {dotted} changes nothing: {named} does not read it"
         if (dotted, value) == ("train.parallel", "fsdp") and launch.world_size() == 1:
             yield f"--set {dotted} changes nothing in one process: start several with torchrun"
+
+
+def _of_retired(
+    recipe: Recipe | StreamRecipe | RobotStreamRecipe | AnyStudy, overrides: Sequence[str]
+) -> Iterator[str]:
+    """Keys that no longer have an effect, in the recipe or among the overrides."""
+    given = {override.partition("=")[0].strip().removeprefix("shared.") for override in overrides}
+    for dotted in sorted(retired()):
+        section, name = dotted.split(".")
+        if isinstance(recipe, Recipe):
+            own, usual = (getattr(getattr(each, section), name) for each in (recipe, _USUAL))
+            is_set = own != usual
+        else:
+            shared = getattr(recipe, "shared", {}).get(section)
+            is_set = isinstance(shared, Mapping) and name in shared
+        if is_set or dotted in given:
+            yield f"{dotted} has no effect any more: what it set is no longer measured. Delete it"
 
 
 def _of_thresholds(chosen: Nullspace) -> Iterator[str]:

@@ -27,7 +27,7 @@ from aegis_cli.cli import (
     resuming,
     stages,
 )
-from aegis_cli.cli.exits import GOES_ON, Commands, ended_by
+from aegis_cli.cli.exits import GOES_ON, LIGHTER, Commands, ended_by
 from aegis_cli.cli.options import (
     AnchorIn,
     Ask,
@@ -449,7 +449,9 @@ def train(
     paths, resolved = _learned_from(resolved, recipe, demos or [])
     advice.of_training(resolved, anchor)
     if not dry_run:
-        ctx.meta[GOES_ON] = partial(resuming.command, resolved, out, paths, anchor, as_they_are)
+        own = resolved, out, paths, anchor, as_they_are
+        ctx.meta[GOES_ON] = partial(resuming.command, *own)
+        ctx.meta[LIGHTER] = partial(resuming.lighter, *own)
     stage = stages.DRY_RUN if dry_run else stages.TRAIN[Recipe]
     # The gate's verdict is printed inside the block, but the process ends outside of it: an exit
     # code other than 0 also ends the other processes, which may still be writing.

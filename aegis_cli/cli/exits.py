@@ -18,6 +18,7 @@ import sys
 import time
 import traceback
 from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any
 
 import typer
@@ -48,6 +49,7 @@ _NO_NUMBER = {
     "float_parsing": "no number",
 }
 GOES_ON = "aegis.goes_on"  # key of a function that returns the words to resume a run, or None
+LIGHTER = "aegis.lighter"  # key of a function that returns those of commands that take less memory
 
 
 class Commands(TyperGroup):
@@ -86,7 +88,7 @@ class Commands(TyperGroup):
             _say(render.error, error)
             raise typer.Exit(2) from None
         except OSError as error:
-            raise typer.Exit(ended_by(error)) from None
+            raise typer.Exit(ended_by(error, ctx.meta)) from None
         except KeyboardInterrupt as error:
             number = error.number if isinstance(error, interrupts.Stopped) else signal.SIGINT
             _say(render.note, f"{_ended(number)}; {_what_now(ctx.meta)}")
@@ -97,7 +99,7 @@ class Commands(TyperGroup):
             if hasattr(error, "show"):
                 raise typer.Exit(_misused(error)) from None
             if _is_out_of_memory(error):
-                _say(render.error, _too_large(error))
+                _say(render.error, _too_large(error, ctx.meta))
                 raise typer.Exit(2) from None
             traceback.print_exc()  # not re-raised: Python would exit with 1, the code of a gate
             raise typer.Exit(3) from None
@@ -178,12 +180,17 @@ def _keys_for(name: str) -> Sequence[str]:
     return other_trainers.KEYS.get(name, ())
 
 
-def ended_by(error: OSError) -> int:
-    """Report an error of the operating system, and return the exit code."""
+def ended_by(error: OSError, meta: Mapping[str, Any] = MappingProxyType({})) -> int:
+    """Report an error of the operating system, and return the exit code.
+
+    Args:
+        meta: of the command's context.
+    """
     if error.errno == errno.EPIPE:  # as with `| head`, where the reader has stopped reading
         _close_output()
         return 128 + signal.SIGPIPE
-    _say(render.error, _too_large(error) if error.errno == errno.ENOMEM else _refused(error))
+    is_memory = error.errno == errno.ENOMEM
+    _say(render.error, _too_large(error, meta) if is_memory else _refused(error))
     _close_output()
     return 2
 
@@ -243,12 +250,17 @@ def _is_out_of_memory(error: Exception) -> bool:
     return isinstance(error, RuntimeError) and any(word in str(error) for word in _WANTING)
 
 
-def _too_large(error: Exception) -> AegisError:
+def _too_large(error: Exception, meta: Mapping[str, Any]) -> AegisError:
     said = (str(error).splitlines() or [""])[0]
     fix = (
         "use a smaller --batch-size or --set train.batch_size=..., fewer train.flow_samples or "
-        "--workers, or train.gradient_checkpointing; see --dry-run"
+        "--workers, or train.gradient_checkpointing or train.accumulate; see --dry-run"
     )
+    if commands := _lighter(meta.get(LIGHTER)):
+        fix = (
+            f"resume in less memory: {', or '.join(commands)}; a smaller train.batch_size or fewer "
+            "train.flow_samples make another run (--overwrite, or another --out)"
+        )
     return AegisError(f"out of memory{': ' * bool(said)}{said}", "work that fits in memory", fix)
 
 
@@ -303,6 +315,16 @@ def _alone(goes_on: Callable[[], list[str] | None] | None) -> list[str] | None:
         return goes_on()
     except AegisError:  # the folder holds another run; the same command will report it
         return None
+
+
+def _lighter(found: Callable[[], list[list[str]]] | None) -> list[str]:
+    """The commands that resume a run in less memory; none if it cannot be resumed."""
+    if found is None:
+        return []
+    try:
+        return [f"{_program()} {shlex.join(words)}" for words in found()]
+    except AegisError:
+        return []
 
 
 def _program() -> str:

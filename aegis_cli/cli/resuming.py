@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from aegis_cli.common import commands
+from aegis_cli.common import commands, launch
 from aegis_cli.common.errors import AegisError
 from aegis_cli.data.selection import Paths
 from aegis_cli.recipes import Recipe
@@ -235,3 +235,40 @@ def command(
         # If the run was extended, the recipe on disk is not this one.
         recipe = longer.plan(out, recipe)
     return ["train", str(out), *options] if folder.goes_on(out, recipe) else None
+
+
+def lighter(
+    recipe: Recipe, out: Path, demos: Paths, anchor: Path | None, options: Sequence[str]
+) -> list[list[str]]:
+    """The words of the commands that resume a policy's run with less memory per step.
+
+    What it learns stays the same but for rounding. There is none if `command` finds none, or if
+    nothing is left to save memory with.
+
+    Args:
+        options: as for `command`.
+    """
+    from aegis_cli import recipes
+
+    words = command(recipe, out, demos, anchor, options)
+    if words is None:
+        return []
+    settings, found = recipe.train, list[list[str]]()
+    if not settings.gradient_checkpointing and _is_of_hugging_face(recipe.backbone):
+        off = ["train.compile=false"] if settings.compile else []  # one of the two
+        found.append(["train.gradient_checkpointing=true", *off])
+    passes = 2 * settings.accumulate
+    fits = passes * launch.world_size() <= settings.batch_size
+    if fits and "accumulate" in recipes.adjustable(recipe):
+        found.append([f"train.accumulate={passes}"])
+    return [[*words, *(w for each in some for w in ("--set", each))] for some in found]
+
+
+def _is_of_hugging_face(backbone: str) -> bool:
+    """Whether a backbone can recompute its activations, as an embedded one cannot."""
+    from aegis_cli.models import backbones
+    from aegis_cli.models.backbones import shapes
+
+    if shapes.of_backbone(backbone) is not None:
+        return True
+    return backbones.locate(backbones.divided(backbone)[0]).is_dir()

@@ -43,6 +43,7 @@ from aegis_cli.recipes.policy import (
 )
 from aegis_cli.recipes.pretraining import DualRecipe, Model, PretrainRecipe, Towers
 from aegis_cli.recipes.reader import (
+    adjustable,
     digest,
     drawn,
     earlier_training_part,
@@ -57,9 +58,11 @@ from aegis_cli.recipes.reader import (
     options,
     read,
     read_anchor,
+    retired,
     selected,
     to_yaml,
     training_part,
+    without_retired,
 )
 from aegis_cli.recipes.streams import (
     LEARNERS,
@@ -159,6 +162,7 @@ __all__ = [
     "VALIDATION",
     "Variant",
     "WEIGHTINGS",
+    "adjustable",
     "anchor_checks",
     "changed",
     "check_run",
@@ -181,8 +185,10 @@ __all__ = [
     "read",
     "read_anchor",
     "recorded",
+    "retired",
     "selected",
     "take_kind",
     "to_yaml",
     "training_part",
+    "without_retired",
 ]

@@ -88,6 +88,7 @@ def key(
     factory: Any = dataclasses.MISSING,
     later: bool = False,
     shapes: bool = True,
+    adjusts: bool = False,
     retired: bool = False,
     doc: str = "",
 ) -> Any:
@@ -102,6 +103,8 @@ def key(
         retired: it no longer has an effect. Older recipes may have it, and their records do.
         shapes: whether it affects the result. Other keys are not part of any record, so a run
             resumes with any value of them.
+        adjusts: it affects memory, time or how often something is written, and the result at most
+            by rounding. It is part of records, but a run of a policy resumes with any value of it.
         doc: meaning and unit, for docs/recipes.md.
     """
     began = default if first is dataclasses.MISSING else first
@@ -110,6 +113,7 @@ def key(
         "first": began,
         "later": later,
         "shapes": shapes,
+        "adjusts": adjusts,
         "retired": retired,
         "doc": doc,
     }
@@ -149,6 +153,12 @@ def recorded(section: Any) -> dict[str, Any]:
 def is_retired(field: dataclasses.Field[Any]) -> bool:
     """Whether a key no longer has an effect."""
     return bool(field.metadata.get("retired"))
+
+
+def adjusting(section: Any) -> set[str]:
+    """The keys of a section that may change when a run is resumed (`adjusts`), or are retired."""
+    fields = dataclasses.fields(section)
+    return {f.name for f in fields if f.metadata.get("adjusts") or is_retired(f)}
 
 
 def is_required(field: dataclasses.Field[Any]) -> bool:

@@ -78,6 +78,9 @@ NEEDS = {
     "kfac": ("curvature",),
     "ewc": ("fisher",),
 }
+# Methods whose gradient depends on how a step is split into passes (`train.accumulate`): they
+# compare statistics of a pass, or take the mean over its answers.
+PASSES_DIFFER = ("aegis", "distill", "insulate", "cotrain")
 # merge -> the part of an anchor that it reads
 MERGE_NEEDS = {"kfac-shrink": "curvature", "inputs": "inputs", "factors": "curvature"}
 # merge -> the keys that it does not read
@@ -388,7 +391,9 @@ class Train:
     validation_share: float = key(
         SHARE, default=0.05, doc="Share of the episodes that is kept for the validation loss."
     )
-    validate_every: int = key(POSITIVE, default=250, doc="Steps between two validation losses.")
+    validate_every: int = key(
+        POSITIVE, default=250, adjusts=True, doc="Steps between two validation losses."
+    )
     validate_actions: int | None = key(
         POSITIVE,
         default=None,
@@ -399,7 +404,9 @@ class Train:
         "trackers; always predicting the mean gives 1. For a robot that is not simulated, no "
         "other figure measures whole actions during training. Null: none.",
     )
-    checkpoint_every: int = key(POSITIVE, default=500, doc="Steps between two checkpoints.")
+    checkpoint_every: int = key(
+        POSITIVE, default=500, adjusts=True, doc="Steps between two checkpoints."
+    )
     keep_checkpoints: int | None = key(
         POSITIVE,
         default=None,
@@ -410,7 +417,9 @@ class Train:
         "the extra one is the best of those that lost no more than `max_drop`, if there is "
         "one.",
     )
-    log_every: int = key(POSITIVE, default=25, doc="Steps between two lines of metrics.jsonl.")
+    log_every: int = key(
+        POSITIVE, default=25, adjusts=True, doc="Steps between two lines of metrics.jsonl."
+    )
     # These belonged to a figure that is no longer measured.
     leak_every: int = key(POSITIVE, default=10, retired=True)
     leak_energy: float = key(SHARE_OR_ONE, default=0.999, retired=True)
@@ -442,11 +451,13 @@ class Train:
     )
     gradient_checkpointing: bool = key(
         default=False,
+        adjusts=True,
         doc="Recompute activations in the backward pass, also the action expert's: less memory at "
         "the price of a second forward pass. Hugging Face backbones only.",
     )
     compile: bool = key(
         default=False,
+        adjusts=True,
         doc="Compile the backbone and the expert with torch.compile. Of a Hugging Face backbone "
         "the layers are compiled, and prompts are padded to multiples of 32 tokens (the "
         "embedded backbone's: of 4).",
@@ -455,6 +466,7 @@ class Train:
         POSITIVE,
         default=1,
         later=True,
+        adjusts=True,
         doc="Number of passes that a step's frames are split into, to save memory (gradient "
         "accumulation).",
     )

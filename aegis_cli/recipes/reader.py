@@ -15,9 +15,9 @@ from aegis_cli.common.files import refuse_special, sha256_value
 from aegis_cli.recipes import shipped
 from aegis_cli.recipes.cross_checks import cross_checks
 from aegis_cli.recipes.decoding import build
-from aegis_cli.recipes.keys import changed, is_retired, recorded
+from aegis_cli.recipes.keys import adjusting, changed, is_retired, recorded
 from aegis_cli.recipes.kinds import KINDS, AnyRecipe, describe, name_of, take_kind
-from aegis_cli.recipes.policy import Anchor, Recipe
+from aegis_cli.recipes.policy import PASSES_DIFFER, Anchor, Recipe
 from aegis_cli.recipes.pretraining import DualRecipe, PretrainRecipe
 from aegis_cli.recipes.streams import TEST, RobotStreamRecipe, StreamRecipe
 from aegis_cli.recipes.strict_yaml import Problem, did_you_mean, dump, override, parse, refuse
@@ -156,6 +156,28 @@ def _plain(value: Any) -> Any:
     return [_plain(item) for item in value] if isinstance(value, tuple | list) else value
 
 
+def retired(kind: type = Recipe) -> frozenset[str]:
+    """The dotted keys of a recipe that no longer have an effect."""
+    found = set[str]()
+    for field in dataclasses.fields(kind):
+        if dataclasses.is_dataclass(field.default):
+            inner = dataclasses.fields(field.default)
+            found.update(f"{field.name}.{own.name}" for own in inner if is_retired(own))
+    return frozenset(found)
+
+
+def without_retired(values: Mapping[str, Any], kind: type = Recipe) -> dict[str, Any]:
+    """A recipe's values by section without those of retired keys."""
+    gone = retired(kind)
+
+    def kept(section: str, inner: Any) -> Any:
+        if not isinstance(inner, Mapping):
+            return inner
+        return {name: value for name, value in inner.items() if f"{section}.{name}" not in gone}
+
+    return {name: kept(name, inner) for name, inner in values.items()}
+
+
 def every_key(recipe: AnyRecipe) -> dict[str, Any]:
     """Every key with its value, including retired keys, as if read from a JSON file."""
     return json.loads(json.dumps(dataclasses.asdict(recipe)))  # JSON turns tuples into lists
@@ -203,6 +225,16 @@ def training_part(recipe: Recipe | StreamRecipe | RobotStreamRecipe) -> dict[str
     if chosen := drawn(recipe):  # the digest of the data does not cover the selection
         part["demos"] = chosen
     return part | _own_part(recipe)
+
+
+def adjustable(recipe: Recipe) -> set[str]:
+    """The keys of `train` with which a run of this recipe may be resumed at any value.
+
+    They change memory, time or how often something is written, and what is learned at most by
+    rounding.
+    """
+    found = adjusting(recipe.train)
+    return found - {"accumulate"} if recipe.train.method in PASSES_DIFFER else found
 
 
 def earlier_training_part(recipe: RobotStreamRecipe, written: Mapping[str, Any]) -> dict[str, Any]:

@@ -183,11 +183,12 @@ def load_any(path: str | Path) -> AnyRecipe:
 
 
 def written_out(recipe: AnyRecipe) -> dict[str, Any]:
-    """Every key with its value, as plain values.
+    """Every key that has an effect with its value, as plain values.
 
     A study's `shared` has every key of its cells' recipes that the study itself does not set.
     """
-    plain = {"kind": recipes.name_of(type(recipe)), **recipes.every_key(recipe)}
+    own = recipes.without_retired(recipes.every_key(recipe), type(recipe))
+    plain = {"kind": recipes.name_of(type(recipe)), **own}
     if not isinstance(recipe, AnyStudy):
         return plain
     rules = _CELL_RULES[type(recipe)]
@@ -197,7 +198,8 @@ def written_out(recipe: AnyRecipe) -> dict[str, Any]:
     for dotted in (*given_below, *_drawn(recipe)):
         section, name = dotted.split(".")  # every such key is in a section
         del shared[section][name]
-    plain["shared"] = {name: value for name, value in shared.items() if name not in rules.given}
+    shared = {name: value for name, value in shared.items() if name not in rules.given}
+    plain["shared"] = recipes.without_retired(shared, rules.recipe)
     return plain
 
 

@@ -78,6 +78,7 @@ class TrainingRun:
         actions: held-out frames for which it predicts actions at every validation; None for none.
         told_of_drop: whether the user was told that accuracy dropped further than the recipe
             allows.
+        told_of_few: whether the user was told that, or that too few questions tell.
     """
 
     recipe: Recipe
@@ -103,6 +104,12 @@ class TrainingRun:
     episodes: ValidationEpisodes | None = None
     actions: ValidationActions | None = None
     told_of_drop: bool = False
+    told_of_few: bool = False
+
+    @property
+    def learns_vlm(self) -> bool:
+        """Whether anything of the backbone learns."""
+        return any(p.requires_grad for p in self.policy.backbone.parameters())
 
     @property
     def shown(self) -> Policy:

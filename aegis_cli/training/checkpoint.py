@@ -5,7 +5,8 @@ checkpoints/000500/backbone/model.safetensors        a plain VLM; in the hub's l
                                                      config.json, the processor's files and a
                                                      README.md
                    expert.safetensors                the action expert and its scales
-                   training_state/state.safetensors  what --resume needs
+                   training_state/state.safetensors  what --resume needs beside the model that the
+                                                     run began with
 checkpoints/last -> 000500
 """
 
@@ -22,7 +23,7 @@ from typing import Any, NamedTuple, cast
 
 import torch
 from safetensors import SafetensorError
-from torch import Tensor
+from torch import Tensor, nn
 
 from aegis_cli import recipes, sim
 from aegis_cli.common import artifacts, commands, files, hub
@@ -76,7 +77,7 @@ def state_of(
             parameter names.
         average: of the weights, by the policy's parameter names.
     """
-    parameters = dict(policy.named_parameters())
+    parameters = learning(policy)
     tensors = optimizer_state.to_tensors(parameters, optimizers)
     tensors |= {_REUSED + name: gradient for name, gradient in (reused or {}).items()}
     tensors |= {_AVERAGE + name: mean for name, mean in (average or {}).items()}
@@ -84,8 +85,17 @@ def state_of(
     return State(tensors, optimizer_state.stateless(parameters, optimizers))
 
 
+def learning(policy: Policy) -> dict[str, nn.Parameter]:
+    """The parameters that a training state holds, by the policy's names: those that learn.
+
+    A resumed run has the frozen ones already: it loads the model that the run began with, and
+    refuses any other by its digest.
+    """
+    return {name: p for name, p in policy.named_parameters() if p.requires_grad}
+
+
 def policy_of(state: State) -> dict[str, Tensor]:
-    """What users of a policy load, by its names: weights or their averages, and buffers."""
+    """What users of a policy load, by its names: learned weights or their averages, and buffers."""
     weights = _named(optimizer_state.WEIGHT, state.tensors) | _named(_AVERAGE, state.tensors)
     return weights | _named(_BUFFER, state.tensors)
 
@@ -585,6 +595,9 @@ def restore(
     running, buffers = _running(policy), _named(_BUFFER, saved.tensors)
     check_state(f"the running averages in '{path}'", buffers, running)
     parameters = dict(policy.named_parameters())
+    frozen = parameters.keys() - learning(policy).keys()
+    if frozen.isdisjoint(_named(optimizer_state.WEIGHT, saved.tensors)):
+        parameters = learning(policy)  # an earlier version wrote the frozen ones too
     others = (_REUSED, _AVERAGE, _BUFFER)
     own = {n: t for n, t in saved.tensors.items() if not n.startswith(others)}
     optimizer_state.from_tensors(own, parameters, optimizers, f"'{path}'", bare)

@@ -694,8 +694,8 @@ def _done(written: Sequence[Path]) -> int:
 def _checkpoint_bytes(training: TrainingRun) -> int:
     """Bytes of a plain backbone, the expert, and what --resume needs.
 
-    The latter is every weight, the optimizer's moments of the trainable ones, and an anchor
-    gradient that later steps share.
+    The latter is every trainable weight with its moments, and an anchor gradient that later steps
+    share.
     """
     plain = _plain_bytes(training)
     expert = _bytes(_tensors(training.policy.expert))
@@ -705,8 +705,9 @@ def _checkpoint_bytes(training: TrainingRun) -> int:
 
 
 def _state_bytes(training: TrainingRun) -> int:
-    """Bytes of all weights, their average and the optimizer state, over all processes."""
-    weights = [*training.policy.parameters(), *training.average.weights.values()]
+    """Bytes of what learns, its average and the optimizer state, over all processes."""
+    learning = checkpoint.learning(training.policy).values()
+    weights = [*learning, *training.average.weights.values()]
     return _bytes(weights) + optimizers.state_bytes(training.optimizers)
 
 

@@ -12,7 +12,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from fnmatch import fnmatch
 from pathlib import Path
 from shlex import quote
-from typing import Any
+from typing import Any, TypeVar
 
 from aegis_cli import recipes
 from aegis_cli.common import commands, files, locks, machine
@@ -37,6 +37,7 @@ _FILES = (
 _FOLDERS = ("encoder", "backbone", "results", "tensorboard", "wandb")
 
 Trained = Recipe | StreamRecipe | RobotStreamRecipe
+T = TypeVar("T", bound=Trained)
 
 
 def check(
@@ -77,7 +78,7 @@ def check(
     if not continues(out, recipe):
         raise AegisError(
             f"the run in '{out}' was started with other settings: "
-            f"{_differences(_begun(out, recipe), recipe)}",
+            f"{_differences(_adjusted(_begun(out, recipe), recipe), recipe)}",
             "the recipe and overrides it began with",
             f"go on with its own: {commands.aegis('train', out)}; compare with '{saved}', or start "
             f"anew in another --out{_or_go_on_from(out, recipe)}",
@@ -101,9 +102,10 @@ def goes_on(out: Path, recipe: Trained) -> bool:
 
 
 def continues(out: Path, recipe: Trained) -> bool:
-    """Whether a run may be resumed with `recipe`, in which its backbone may have another path.
+    """Whether a run may be resumed with `recipe`.
 
-    The checkpoints of a policy's run hold the backbone's digest, which is compared later.
+    Its backbone may have another path there: the checkpoints of a policy's run hold the backbone's
+    digest, which is compared later. Keys of `recipes.adjustable` may have other values.
     """
     begun = _begun(out, recipe)
     if isinstance(begun, Recipe) and isinstance(recipe, Recipe) and checkpoint.begun(out):
@@ -113,7 +115,33 @@ def continues(out: Path, recipe: Trained) -> bool:
         _, layers_here = backbones.divided(recipe.backbone)
         if layers_there == layers_here:
             begun = dataclasses.replace(begun, backbone=recipe.backbone)
-    return recipes.training_part(begun) == recipes.training_part(recipe)
+    return recipes.training_part(_adjusted(begun, recipe)) == recipes.training_part(recipe)
+
+
+def _adjusted(recipe: T, like: T) -> T:
+    """The recipe with another's values of the keys that may change when a run is resumed."""
+    if not isinstance(recipe, Recipe) or not isinstance(like, Recipe):
+        return recipe  # a stream's may not
+    names = recipes.adjustable(recipe) & recipes.adjustable(like)
+    values = {name: getattr(like.train, name) for name in names}
+    return dataclasses.replace(recipe, train=dataclasses.replace(recipe.train, **values))
+
+
+def as_begun(out: Path, recipe: Recipe) -> Recipe:
+    """The recipe with the run's values of the keys that may change when it is resumed."""
+    return _adjusted(recipe, recipes.load(out / "recipe.yaml", kind=Recipe))
+
+
+def adjustments(out: Path, recipe: Recipe) -> str:
+    """The keys of `recipe` that change when the run is resumed with it; empty if none does."""
+    there, here = as_begun(out, recipe).train, recipe.train
+    names = {n for n in recipes.adjustable(recipe) if f"train.{n}" not in recipes.retired()}
+    found = []
+    for name in sorted(names):
+        old, new = getattr(there, name), getattr(here, name)
+        if old != new:
+            found.append(f"train.{name}: {_said(new)} instead of {_said(old)}")
+    return ", ".join(found)
 
 
 def _begun(out: Path, recipe: Trained) -> Trained:

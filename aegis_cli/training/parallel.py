@@ -188,12 +188,13 @@ def gathered(tensors: Mapping[str, Tensor], ranks: Ranks) -> dict[str, Tensor]:
 
 @torch.no_grad()
 def filled(plain: Policy, weights: Mapping[str, Tensor]) -> Policy:
-    """Copy these weights and buffers, by their names in the policy, into an unsharded policy."""
-    for name, parameter in plain.named_parameters():
-        parameter.copy_(weights[name])
-    for name, buffer in plain.named_buffers():
+    """Copy these weights and buffers, by their names in the policy, into an unsharded policy.
+
+    Others stay: frozen weights are the same in both.
+    """
+    for name, tensor in [*plain.named_parameters(), *plain.named_buffers()]:
         if name in weights:
-            buffer.copy_(weights[name])
+            tensor.copy_(weights[name])
     return plain
 
 

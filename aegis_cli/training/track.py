@@ -258,7 +258,7 @@ def _name(out: Path) -> str:
 
 def _config(recipe: Recipe) -> dict[str, Any]:
     """The settings that affect the training, which a tracker shows beside the curves."""
-    return {"recipe": recipe.name, **recipes.training_part(recipe)}
+    return {"recipe": recipe.name, **recipes.without_retired(recipes.training_part(recipe))}
 
 
 _TRACKERS = {"tensorboard": _tensorboard, "trackio": _trackio, "wandb": _wandb}

@@ -36,10 +36,11 @@ from aegis_cli.core.ledger import Ledger, conflict_share, energy_shed_mean
 from aegis_cli.data import augment, demonstrations, mixture, spread
 from aegis_cli.data.batch import RobotBatch
 from aegis_cli.data.selection import Paths
+from aegis_cli.data.vqa.gate import UPPER
 from aegis_cli.data.vqa.metrics import Graded
 from aegis_cli.methods.base import Parts
 from aegis_cli.methods.known_parameters import check_row
-from aegis_cli.models import flow
+from aegis_cli.models import flow, structure
 from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.models.buffers import WrittenBuffers
 from aegis_cli.models.policy import Policy
@@ -52,6 +53,7 @@ from aegis_cli.training import (
     inputs,
     longer,
     parallel,
+    retention,
     step,
     track,
     validation_actions,
@@ -64,6 +66,7 @@ from aegis_cli.training.validation_vqa import ToldOfSet, ValidationQuestions
 
 LEDGER = "ledger.safetensors"
 INTERRUPTED = "interrupted"  # in a training state's header: the sums since the last line of metrics
+UNLOGGED = "unlogged"  # in such a header: true if no line of metrics had been written yet
 VALIDATION_FRAMES = 512
 # A validation reports its own progress if training steps on as many batches would take longer than
 # this; questions do if their answers took longer before training, and episodes and predicted
@@ -157,9 +160,11 @@ def run(
         if ranks.first:
             longer.check(out, recipe, resume, overwrite, places, on_event)
         goes_on = ranks.agree(ranks.first and not overwrite and checkpoint.begun(out))
+        is_finished = goes_on and _has_ended(out, recipe)
+        if is_finished:  # no step is left that would be taken in another way
+            recipe = folder.as_begun(out, recipe)
         with loading_told("train", on_event):
             training = assemble.build(recipe, chosen, demos, anchor, out, on_event, ranks)
-        is_finished = goes_on and _has_ended(out, recipe)
         if not is_finished:
             training.episodes = validation_rollout.chosen(
                 recipe, training.shown, training.meta, ranks
@@ -169,12 +174,14 @@ def run(
             )
             training.questions = _asked_before(training, on_event)
         if goes_on:
+            _check_passes(training)
             restored = _restore(training, places)
             # If all steps have been taken, `_train` takes none and only reports.
             if is_finished:
                 on_event(Progress("train (up to date)", 1, 1, "stage"))
             else:
                 _warn_of_another_precision(training, on_event)
+                _tell_of_adjustments(training, on_event)
             if ranks.first:
                 if _says_otherwise(out, recipe, places):
                     folder.write_recipe(out, recipe)
@@ -244,6 +251,30 @@ def _warn_of_another_precision(run: TrainingRun, on_event: OnEvent) -> None:
             f"'{run.out}' began with matrix products in {begun} ({machine.NAME}), and goes on in "
             f"{now}, which is what train.precision: {run.recipe.train.precision} means on this "
             "machine: its weights will match neither"
+        )
+        on_event(Warned("train", text))
+
+
+def _check_passes(run: TrainingRun) -> None:
+    """Refuse another number of passes per step where batch normalisation reads those of a pass."""
+    begun, now = folder.as_begun(run.out, run.recipe).train.accumulate, run.recipe.train.accumulate
+    if begun != now and structure.averaging(run.policy.backbone):
+        raise AegisError(
+            f"train.accumulate: {now} for the run in '{run.out}', which began with {begun}, and "
+            "whose backbone normalises over the frames of a pass",
+            "as many passes as it began with",
+            f"go on with its own: {commands.aegis('train', run.out)}",
+        )
+
+
+def _tell_of_adjustments(run: TrainingRun, on_event: OnEvent) -> None:
+    """Say which settings a resumed run takes that it did not have so far."""
+    changes = folder.adjustments(run.out, run.recipe)
+    if changes:
+        text = (
+            f"'{run.out}' goes on with {changes}. This changes memory, time or what is written, "
+            "and what is learned at most by rounding; files may differ from those of an "
+            "uninterrupted run"
         )
         on_event(Warned("train", text))
 
@@ -414,6 +445,7 @@ def _check_behind(
     method = meta.get("method")
     rows = kept.tensors["step"][:done].tolist()
     settings = run.recipe.train
+    log_every = folder.as_begun(run.out, run.recipe).train.log_every  # may change from here on
     # Steps in which the backbone is frozen have no row.
     moving = moving_steps(settings.steps, settings.backbone_until)
     moved = min(done, moving)
@@ -426,7 +458,7 @@ def _check_behind(
         problem = f"the {LEDGER} of another run"
     elif rows != wanted or [kept.header.meta.get(k) for k in ("groups", "layers")] != columns:
         problem = f"a {LEDGER} without exactly the steps 1 to {moved} before its end"
-    elif not lines and done >= settings.log_every:
+    elif not lines and done >= log_every and meta.get(UNLOGGED) is not True:
         problem = f"an empty {folder.METRICS} after {done} steps"
     elif done < moving and run.parts.reuses(done) and not run.reused:
         problem = f"a checkpoint of step {done} without the anchor gradient that the next reuses"
@@ -519,6 +551,8 @@ def _train(run: TrainingRun, done: int, window: Window, on_event: OnEvent) -> Tr
             if _heeds(run, due) and run.ranks.any(signaled.number is not None)[0]:
                 _save_interrupted(run, finished, window)
                 signaled.leave()
+    if done < settings.steps:
+        _tell_of_no_checkpoint_within(run, on_event)
     return run.ranks.by_first(lambda: _report(run))
 
 
@@ -578,7 +612,13 @@ def _save_interrupted(run: TrainingRun, finished: int, window: Window) -> None:
     """Write the checkpoint that a run is resumed from after a signal."""
     with _good_steps_saved(run):
         read_figures(run, window)
-    _save(run, finished, {INTERRUPTED: dataclasses.asdict(window)})
+    _save(run, finished, {INTERRUPTED: dataclasses.asdict(window), **_unlogged(run)})
+
+
+def _unlogged(run: TrainingRun) -> dict[str, bool]:
+    """What a checkpoint that no line of metrics belongs to says, if there is no line at all."""
+    is_logged = not run.ranks.first or bool(folder.read_metrics(run.out))  # the first one writes
+    return {} if is_logged else {UNLOGGED: True}
 
 
 @contextmanager
@@ -698,7 +738,7 @@ def _good_steps_saved(run: TrainingRun) -> Generator[None]:
         yield
     except Diverged as end:
         good = end.good_steps
-        _save(run, good)
+        _save(run, good, _unlogged(run))
         steps = "1 good step is" if good == 1 else f"{good} good steps are"
         kept = f"the {steps} in {run.out}/checkpoints/last; {end.fix}"
         raise Diverged(end.found, end.expected, kept, good) from None
@@ -992,17 +1032,32 @@ def _watched(run: TrainingRun, finished: int, hearing: _Hearing) -> dict[str, fl
 
 
 def _warn_of_drop(run: TrainingRun, line: Mapping[str, float], on_event: OnEvent) -> None:
-    """Warn the first time that the drop exceeds what the recipe's gate allows."""
-    past = validation_vqa.past_limit(run.recipe, validation_vqa.of_line(run.recipe, line))
-    if not past or run.told_of_drop:
+    """Warn the first time that the drop, or only its interval, exceeds what the gate allows."""
+    recipe = run.recipe
+    past = validation_vqa.past_limit(recipe, validation_vqa.of_line(recipe, line))
+    if not past or not run.learns_vlm:  # a frozen VLM has lost nothing, however few its questions
         return
-    run.told_of_drop = True
-    name, told = next(iter(past.items()))
-    low, high = told["drop_interval"]
+    is_lost = any(validation_vqa.is_lost(recipe, told) for told in past.values())
+    if run.told_of_drop or (run.told_of_few and not is_lost):
+        return
+    run.told_of_drop, run.told_of_few = is_lost, True
+    on_event(Warned("train", validation_vqa.of_past_limit(recipe, int(line["step"]), past)))
+
+
+def _tell_of_no_checkpoint_within(run: TrainingRun, on_event: OnEvent) -> None:
+    """Say at the end of a training if no checkpoint that is kept is known to pass the gate."""
+    if run.recipe.train.keep_checkpoints is None or not run.learns_vlm or not run.ranks.first:
+        return
+    steps = [int(path.name) for path in checkpoint.whole(run.out)]
+    best = retention.best(run.out, steps, run.recipe)
+    if best.passes is not False:
+        return
+    probe = run.recipe.probe
+    by = " by the upper end of its interval (probe.gate)" if probe.gate == UPPER else ""
     text = (
-        f"after step {line['step']} {told['drop_points']:.2f} points of VQA are lost ({low:.2f} to "
-        f"{high:.2f}) on validation questions of '{name}', where probe.max_drop allows "
-        f"{run.recipe.probe.max_drop:g}"
+        f"no checkpoint is known to have lost at most {probe.max_drop:g} points of VQA{by}, which "
+        f"probe.max_drop allows: the one kept as the best, of step {best.step}, has the lowest "
+        "validation loss"
     )
     on_event(Warned("train", text))
 

@@ -127,6 +127,35 @@ def past_limit(recipe: Recipe, asked: Mapping[str, ToldOfSet]) -> dict[str, Told
     return found
 
 
+def is_lost(recipe: Recipe, told: ToldOfSet) -> bool:
+    """Whether a set's drop as measured exceeds the limit, and not just its interval."""
+    limit = recipe.probe.max_drop
+    return limit is not None and not passes(told["drop_points"], None, limit)
+
+
+def of_past_limit(recipe: Recipe, step: int, past: Mapping[str, ToldOfSet]) -> str:
+    """A sentence on the set that is furthest past the recipe's limit.
+
+    Args:
+        past: what `past_limit` returned, of at least one set.
+    """
+    name, told = max(past.items(), key=lambda item: item[1]["drop_points"])
+    low, high = told["drop_interval"]
+    drop, limit = told["drop_points"], f"{recipe.probe.max_drop:g}"
+    where = f"on validation questions of '{name}'"
+    if is_lost(recipe, told):
+        return (
+            f"after step {step} {drop:.2f} points of VQA are lost ({low:.2f} to {high:.2f}) "
+            f"{where}, where probe.max_drop allows {limit}"
+        )
+    return (
+        f"after step {step} there are too few answers to tell whether more than {limit} points of "
+        f"VQA are lost (probe.max_drop): it is {drop:.2f} {where}, with a 95 % interval of "
+        f"{low:.2f} to {high:.2f}, whose upper end counts (probe.gate: {recipe.probe.gate}); raise "
+        "probe.while_training"
+    )
+
+
 def chosen(recipe: Recipe, backbone: Backbone, on_event: OnEvent) -> ValidationQuestions | None:
     """The questions that a recipe's training asks; None if it asks none.
 

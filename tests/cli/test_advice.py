@@ -45,6 +45,26 @@ def test_a_real_model_is_warned_of_scenes_alone(real: str, said: Said, tiny_fold
     assert said() == ""
 
 
+@pytest.mark.parametrize("own", [10, 3])  # the first is the default
+def test_a_key_that_has_no_effect_any_more_is_told(
+    own: int, said: Said, tiny_folder: Path, tmp_path: Path
+) -> None:
+    plain = recipe(tiny_folder)
+    advice.of_settings(plain)
+    assert said() == ""
+    advice.of_settings(plain, [f"train.leak_every={own}"])
+    text = said()
+    assert "train.leak_every has no effect any more" in text and text.count("\n") == 1
+    advice.of_settings(replace(plain, train=replace(plain.train, leak_energy=0.5)))
+    assert "train.leak_energy has no effect any more" in said()
+    path = tmp_path / "study.yaml"
+    shared = f"{{backbone: {tiny_folder}, train: {{leak_every: {own}}}, anchor: {{vqa: x.jsonl}}"
+    text = f"kind: study\nname: s\ntasks: [reach]\nseeds: [0]\nshared: {shared}, "
+    path.write_text(text + "probe: {vqa: x.jsonl}}\nvariants:\n  a: {method: naive}\n")
+    advice.of_run(load(path))
+    assert said().count("train.leak_every has no effect any more") == 1
+
+
 def test_a_recipe_is_warned_of_what_it_asks(real: str, said: Said) -> None:
     fine = replace(recipe(real), anchor=Anchor(vqa="x.jsonl"), probe=Probe(vqa="x.jsonl"))
     advice.of_run(fine)

@@ -120,6 +120,42 @@ def test_an_interruption_names_the_command(
     assert code == 0 and steps_of(place / "runs") == 3, err
 
 
+@pytest.mark.parametrize(
+    ("method", "more", "named"),
+    [
+        ("naive", (), "train.accumulate=2"),
+        ("naive", ("--set", "train.accumulate=2"), "train.accumulate=4"),
+        ("naive", ("--set", "train.accumulate=4"), None),  # a frame per pass
+        ("aegis", (), None),
+    ],
+)
+def test_want_of_memory_names_the_command_that_goes_on_with_less(
+    method: str,
+    more: tuple[str, ...],
+    named: str | None,
+    place: Path,
+    aegis: Aegis,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    stage, begun = stages.TRAIN[recipes.Recipe].module, train.run
+
+    def too_large(*args: object, on_event: object, **options: object) -> None:
+        begun(*args, **options, on_event=stop_at(2, MemoryError()))
+
+    monkeypatch.setattr(stage, "run", too_large)
+    code, _, err = aegis(*training(method=method), *more)
+    assert code == 2 and "out of memory" in err
+    if named is None:
+        assert "resume" not in err and "train.batch_size" in err
+        return
+    words = ["train", "runs", "--set", named]
+    assert f"resume in less memory: aegis {' '.join(words)}; a smaller train.batch_size" in err
+    monkeypatch.setattr(stage, "run", begun)
+    code, _, err = aegis(*words)
+    assert code == 0 and steps_of(place / "runs") == 4, err
+    assert recipes.load(place / "runs" / "recipe.yaml").train.accumulate == int(named[-1])
+
+
 def test_where_nothing_has_begun_or_another_run_is_there_still_the_same_command_is_named(
     place: Path, aegis: Aegis, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -470,6 +470,25 @@ def test_a_resumed_run_ends_in_the_same_bytes(
     assert_same_run(run, tmp_path / "run")
 
 
+def test_a_run_may_begin_to_recompute_activations_when_it_resumes(
+    run: Path, hf_folder: Made, hf_anchor: Made, demos_file: Path, tmp_path: Path
+) -> None:
+    settings = small(hf_folder("paligemma"))
+
+    def stop(event: Any) -> None:
+        if event.stage == "train" and event.done == 3:
+            raise KeyboardInterrupt
+
+    given = "aegis", demos_file, hf_anchor("paligemma"), tmp_path
+    with pytest.raises(KeyboardInterrupt):
+        train.run(settings, *given, on_event=stop)
+    settings = small(hf_folder("paligemma"), gradient_checkpointing=True)
+    train.run(settings, *given, resume=True)
+    wanted, found = (backbones.load(str(out)).state_dict() for out in (run, tmp_path))
+    for name, weight in wanted.items():
+        torch.testing.assert_close(found[name], weight, rtol=1e-3, atol=1e-4, msg=name)
+
+
 @pytest.mark.parametrize(
     ("method", "family"),
     [("lora", "paligemma"), ("nullspace", "paligemma"), ("nullspace", "llava_onevision")],

@@ -70,6 +70,7 @@ def test_a_tracker_gets_every_line_of_the_log(
     assert [{"step": step, **figures} for step, figures in tracker.lines] == lines
     assert tracker.finished and tracker.begun["name"] == "job-naive"
     assert tracker.begun["config"]["train"]["steps"] == recipe.train.steps
+    assert not [key for key in tracker.begun["config"]["train"] if "leak" in key]  # retired
     assert {"loss", "lr_backbone", "data_s", "step_s"} <= {k for x in lines for k in x}
 
 

@@ -262,6 +262,91 @@ def test_more_than_the_recipe_allows_is_said_once(
         assert "probe.max_drop allows 0" in text
 
 
+def drops(monkeypatch: pytest.MonkeyPatch, by_validation: list[float]) -> None:
+    """Replace the measured drops, one for each validation, by these and an interval of 8 points."""
+    figures, left = validation_vqa.ValidationQuestions.figures, iter(by_validation)
+
+    def told(*given: Any) -> dict[str, float]:
+        drop = next(left)
+        ends = {"vqa_drop_low": drop - 4.0, "vqa_drop_high": drop + 4.0}
+        return figures(*given) | {"vqa_drop_points": drop} | ends
+
+    monkeypatch.setattr(validation_vqa.ValidationQuestions, "figures", told)
+
+
+def warnings_of(start: Start, method: str, recipe: Recipe, out: Path) -> list[str]:
+    """What a training says of the gate on its validation questions."""
+    events: list[Event] = []
+    start(method, out, recipe=recipe, on_event=events.append)
+    texts = [event.text for event in events if isinstance(event, Warned)]
+    return [text for text in texts if "max_drop" in text]
+
+
+def gated(recipe: Recipe, gate: str, **train: Any) -> Recipe:
+    probe = replace(recipe.probe, max_drop=3.0, gate=gate)
+    settings = replace(recipe.train, validate_every=2, checkpoint_every=2, **train)
+    return replace(recipe, probe=probe, train=settings)
+
+
+def test_a_vlm_that_cannot_change_loses_nothing_however_few_its_questions(
+    asking: Recipe, start: Start, tmp_path: Path
+) -> None:
+    own = gated(asking, "upper", keep_checkpoints=1)
+    assert warnings_of(start, "stop-gradient", own, tmp_path / "run") == []
+    told = validation_vqa.of_line(own, metrics(tmp_path / "run")[-1])
+    assert validation_vqa.past_limit(own, told)  # the interval alone would not pass
+
+
+def test_too_few_questions_are_no_loss_and_a_loss_is_said_after_them(
+    asking: Recipe, start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drops(monkeypatch, [0.0, 1.0, 7.0])
+    few, lost = warnings_of(start, "naive", gated(asking, "upper"), tmp_path / "run")
+    assert "after step 2 there are too few answers to tell" in few and "are lost (-" not in few
+    assert "-4.00 to 4.00, whose upper end counts (probe.gate: upper)" in few
+    assert "probe.while_training" in few
+    assert "after step 6 7.00 points of VQA are lost (3.00 to 11.00)" in lost
+
+
+def test_a_loss_that_is_said_is_not_put_in_doubt_later(
+    asking: Recipe, start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drops(monkeypatch, [7.0, 1.0, 1.0])
+    (lost,) = warnings_of(start, "naive", gated(asking, "upper"), tmp_path / "run")
+    assert "7.00 points of VQA are lost" in lost
+
+
+@pytest.mark.parametrize(
+    ("gate", "found", "kept", "says"),
+    [
+        ("mean", [5.0, 6.0, 7.0], 1, "to have lost at most 3 points of VQA, which"),
+        ("upper", [0.0, 0.0, 0.0], 1, "VQA by the upper end of its interval (probe.gate), which"),
+        ("mean", [5.0, 2.0, 7.0], 1, None),
+        ("mean", [5.0, 6.0, 7.0], None, None),  # all of them are there to choose from
+    ],
+)
+def test_a_run_says_if_no_checkpoint_is_within_the_limit_and_which_is_kept(
+    gate: str,
+    found: list[float],
+    kept: int | None,
+    says: str | None,
+    asking: Recipe,
+    start: Start,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    drops(monkeypatch, found)
+    own = gated(asking, gate, keep_checkpoints=kept)
+    said = warnings_of(start, "naive", own, tmp_path / "run")
+    last = [text for text in said if text.startswith("no checkpoint is known")]
+    assert len(last) == (says is not None)
+    losses = {line["step"]: line.get("validation_loss") for line in metrics(tmp_path / "run")}
+    least = min((loss, step) for step, loss in losses.items() if loss is not None)[1]
+    for text in last:
+        assert says is not None and says in text and f"of step {least}, has the lowest" in text
+        assert least in [int(path.name) for path in checkpoint.whole(tmp_path / "run")]
+
+
 # --- what is refused ------------------------------------------------------------------------------
 
 
