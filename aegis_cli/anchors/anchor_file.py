@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import torch
@@ -17,9 +18,11 @@ from torch import Tensor
 
 from aegis_cli.anchors.second_moments import shared
 from aegis_cli.common import artifacts
+from aegis_cli.common.errors import AegisError
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.moments import Moments
 from aegis_cli.core.spectrum import Spectrum, orthonormal, with_rest
+from aegis_cli.models.backbones import preparation
 
 TYPES = ("image", "text")
 _SPECTRA = ("inputs", "curvature")
@@ -103,13 +106,31 @@ def _spectrum_tensors(site: str, spectrum: Spectrum, dtype: torch.dtype) -> dict
     return found
 
 
-def load(path: Path, fingerprint: str) -> Anchor:
+def load(
+    path: Path, fingerprint: str, prepares: Mapping[str, str] = MappingProxyType({})
+) -> Anchor:
     """Read the anchor of the backbone with this fingerprint.
 
+    Args:
+        prepares: the settings by which the backbone's inputs are made; an anchor that names none
+            of them is read too.
+
     Raises:
-        AegisError: no anchor, a damaged one, or that of another backbone.
+        AegisError: no anchor, a damaged one, that of another backbone, or one of inputs that were
+            made by other settings.
     """
-    return from_artifact(artifacts.load(path, "anchor", fingerprint=fingerprint))
+    artifact = artifacts.load(path, "anchor", fingerprint=fingerprint)
+    other = preparation.differing(prepares, artifact.header.meta.get(preparation.META, {}))
+    if other is not None:
+        raise AegisError(
+            f"a backbone that makes its inputs of images and texts otherwise than when the anchor "
+            f"'{path}' was measured: {other}",
+            "the same settings of the processor, since the anchor describes what the weights do "
+            "with these inputs",
+            "measure the anchor again with aegis anchor, or bring the settings back in the "
+            "model's folder (e.g. in its preprocessor_config.json)",
+        )
+    return from_artifact(artifact)
 
 
 def from_artifact(artifact: artifacts.Artifact) -> Anchor:

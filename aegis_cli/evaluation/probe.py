@@ -24,6 +24,7 @@ from aegis_cli.data.vqa.metrics import Graded, by_family, drop_interval, predict
 from aegis_cli.evaluation import kept_answers, results, wrong_answers
 from aegis_cli.models import backbones
 from aegis_cli.models.asking import ask
+from aegis_cli.models.backbones import preparation
 from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.training import checkpoint
 from aegis_cli.training.folder import METRICS
@@ -138,6 +139,7 @@ def run(
     model = loaded.model
     before = None if reference_model is None else reference_model.model
     if before is not None:
+        _check_preparation(target, baseline, model, before, max_drop, on_event)
         _warn_of_another_start(target, baseline, before, on_event)
     measured = None if anchor is None else _anchor(anchor, model, before)
     # Both models have to read every question, since the drop compares the same questions.
@@ -264,6 +266,40 @@ def warn_of_few_questions(
     on_event(Warned(stage, text))
 
 
+def _check_preparation(
+    target: str,
+    baseline: str | None,
+    model: Backbone,
+    before: Backbone,
+    max_drop: float | None,
+    on_event: OnEvent,
+) -> None:
+    """Warn if two models make different inputs of the same questions.
+
+    Raises:
+        AegisError: they do, and a gate would judge the training by the drop.
+    """
+    other = preparation.differing(model.preparation(), before.preparation())
+    if other is None:
+        return
+    found = (
+        f"'{target}' prepares images or text otherwise than its baseline '{baseline}' does: {other}"
+    )
+    fix = (
+        "give both the same files of the processor (e.g. preprocessor_config.json; a run has its "
+        "own in checkpoints/last/backbone)"
+    )
+    if max_drop is not None:
+        raise AegisError(
+            found,
+            f"the same settings for a gate (--max-drop {max_drop:g}), which judges what the "
+            "training has cost",
+            fix,
+        )
+    text = f"{found}. So the drop is not that of the weights alone: {fix}"
+    on_event(Warned("probe", text))
+
+
 def _warn_of_another_start(
     target: str, baseline: str | None, before: Backbone, on_event: OnEvent
 ) -> None:
@@ -322,7 +358,8 @@ def answers(
         graded = ask(model, asked, batch_size, on_event, ranks)
         layers = []
         if anchor is not None:
-            layers = drift(model, asked, anchor_file.load(*anchor), batch_size, ranks)
+            known = anchor_file.load(*anchor, model.preparation())
+            layers = drift(model, asked, known, batch_size, ranks)
     return Answers(graded, layers, model.image_size)
 
 
@@ -331,9 +368,10 @@ def _anchor(path: Path, model: Backbone, before: Backbone | None) -> Anchor:
 
     An anchor measured on a trained backbone would hide the drift.
     """
-    owner = (model if before is None else before).fingerprint()
+    pre_trained = model if before is None else before
+    owner = pre_trained.fingerprint()
     try:
-        measured = anchor_file.load(path, owner)
+        measured = anchor_file.load(path, owner, pre_trained.preparation())
     except AegisError as error:
         if before is not None or artifacts.read_header(path).fingerprint == owner:
             raise

@@ -70,7 +70,7 @@ def _given(path: Path, source: Source, settings: MergeSettings, part: str) -> An
     Raises:
         AegisError: no anchor, an anchor of another model, or one without the part.
     """
-    found = anchor_file.load(path, source.base.fingerprint())
+    found = anchor_file.load(path, source.base.fingerprint(), source.base.preparation())
     if not getattr(found, part):
         raise AegisError(
             f"an anchor without {part} for method '{settings.method}'",

@@ -10,8 +10,6 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, cast
 
-import torch
-
 from aegis_cli import recipes, sim
 from aegis_cli.anchors import anchor_file
 from aegis_cli.common import artifacts, devices, launch
@@ -79,7 +77,11 @@ def load(
     backbone = backbones.load(recipe.backbone).to("cpu" if shards else device)
     fingerprint = backbone.fingerprint()
     watched = WatchedFiles([] if anchor is None else [anchor])
-    measured = None if anchor is None else _measured(anchor, fingerprint, method, device)
+    measured = None
+    if anchor is not None:
+        known = anchor_file.load(anchor, fingerprint, backbone.preparation())
+        # The parts that the method reads.
+        measured = anchor_file.to_device(anchor_file.only(known, method.needs), device)
     _check_parts(method, measured, recipe)
     # Last, since this may decode hours of video.
     recorded = _demonstrations(recipe, backbone, demos, on_event, ranks)
@@ -242,12 +244,6 @@ def check_cameras(backbone: Backbone, recipe: Recipe | RobotStreamRecipe) -> Non
             "one camera, or a Hugging Face backbone",
             f"--set demos.camera={named[0]}",
         )
-
-
-def _measured(path: Path, fingerprint: str, method: Method, device: torch.device) -> Anchor:
-    """The parts of the anchor that the method reads."""
-    found = anchor_file.only(anchor_file.load(path, fingerprint), method.needs)
-    return anchor_file.to_device(found, device)
 
 
 def _check_parts(method: Method, anchor: Anchor | None, recipe: Recipe) -> None:

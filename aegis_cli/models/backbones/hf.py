@@ -123,6 +123,9 @@ class HFBackbone(Backbone):
         digests = {name: hashlib.sha256(own).hexdigest() for name, own in contents.items()}
         return {"ends": str(self.vlm.generation_config.eos_token_id), **digests}
 
+    def preparation(self) -> Mapping[str, str]:
+        return self._prompter.preparation
+
     def _measure_keys(self) -> tuple[int, int]:
         """The number and size of the key heads, from a pass over one black image.
 

@@ -10,6 +10,7 @@ import copy
 import textwrap
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -18,6 +19,7 @@ from torch import Tensor
 
 from aegis_cli.common.errors import AegisError, in_short
 from aegis_cli.data.batch import Images
+from aegis_cli.models.backbones import preparation
 from aegis_cli.models.backbones.base import Batch
 from aegis_cli.models.backbones.families import Family
 from aegis_cli.models.backbones.model_folder import misfit
@@ -70,6 +72,12 @@ class Prompter:
         self._longest, self._words = longest, words
         self._tokenizer = processor.tokenizer  # of the original
         self._markers = _markers(processor, image_token)
+
+    @cached_property
+    def preparation(self) -> dict[str, str]:
+        """The processor's settings; see preparation.py."""
+        with self._processors.one() as processor:
+            return preparation.of(processor)
 
     def process(self, images: Images, prompts: Sequence[str], side: str) -> Batch:
         """Prompts with one or several images [H, W, 3] uint8 of any size each, padded on `side`.
