@@ -139,7 +139,7 @@ def run(
     model = loaded.model
     before = None if reference_model is None else reference_model.model
     if before is not None:
-        _check_preparation(target, baseline, model, before, max_drop, on_event)
+        check_preparation(target, baseline, model, before, max_drop, "probe", on_event)
         _warn_of_another_start(target, baseline, before, on_event)
     measured = None if anchor is None else _anchor(anchor, model, before)
     # Both models have to read every question, since the drop compares the same questions.
@@ -266,12 +266,13 @@ def warn_of_few_questions(
     on_event(Warned(stage, text))
 
 
-def _check_preparation(
+def check_preparation(
     target: str,
     baseline: str | None,
     model: Backbone,
     before: Backbone,
     max_drop: float | None,
+    stage: str,
     on_event: OnEvent,
 ) -> None:
     """Warn if two models make different inputs of the same questions.
@@ -296,8 +297,8 @@ def _check_preparation(
             "training has cost",
             fix,
         )
-    text = f"{found}. So the drop is not that of the weights alone: {fix}"
-    on_event(Warned("probe", text))
+    text = f"{found}. So a drop is not that of the weights alone: {fix}"
+    on_event(Warned(stage, text))
 
 
 def _warn_of_another_start(

@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from samples.hf import save_processor
+from samples.command import refused as refused_in
+from samples.hf import save_processor, write
 from samples.small_run import recipe as small
 
 from aegis_cli.anchors import anchor_file
@@ -122,7 +123,7 @@ def test_a_probe_warns_of_a_baseline_that_is_shown_other_images_and_does_not_jud
     probe.run(**asked, baseline=str(edited), max_drop=None, on_event=seen.append)
     mean = "image_mean [0.5, 0.5, 0.5] instead of [0.4, 0.4, 0.4]"
     (told,) = [e.text for e in seen if isinstance(e, Warned) and mean in e.text]
-    assert "the drop is not that of the weights alone" in told
+    assert "a drop is not that of the weights alone" in told
     with pytest.raises(AegisError) as refused:
         probe.run(**asked, baseline=str(edited), max_drop=5.0)
     assert mean in refused.value.found and "gate" in refused.value.expected
@@ -149,6 +150,18 @@ def test_a_run_goes_on_only_with_the_images_that_it_began_with(
     change(own, image_mean=[0.5, 0.5, 0.5])
     train.run(longer, "naive", demos_file, None, out, resume=True)
     assert checkpoint.last(out).resolve().name == "000004"
+
+
+def test_a_merge_warns_of_a_base_that_is_shown_other_images_and_does_not_judge(
+    edited: Path, aegis: Callable[..., Any], tmp_path: Path
+) -> None:
+    tuned, mean = write("smolvlm", tmp_path / "tuned", seed=1), "image_mean [0.5, 0.5, 0.5] instead"
+    words = ("merge", tuned, "--base", edited, "--method", "linear")
+    code, _, err = aegis(*words, "--strength", 0.5, "--out", tmp_path / "merged")
+    assert code == 0 and mean in " ".join(err.split())
+    gate = ("--sweep", 1, "--max-drop", 5, "--out", tmp_path / "judged")
+    assert mean in " ".join(refused_in(aegis(*words, *gate)).split())
+    assert not (tmp_path / "judged").exists()
 
 
 def test_the_embedded_models_record_no_settings(anchor_file: Path, tiny_folder: Path) -> None:
