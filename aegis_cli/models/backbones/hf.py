@@ -397,8 +397,8 @@ class HFBackbone(Backbone):
     ) -> Iterator[AnswerScores]:
         """See `Backbone.read_vqa`; an image is passed per question, which may affect its states."""
         said = self._prompter.answer_ids(answers)
-        # Shapes matter because images of different sizes may become different numbers of tokens.
-        shapes = [tuple(images[i].shape) for i in image_of.tolist()]
+        shown = [images[i] for i in image_of.tolist()]
+        shapes = self._prompter.shapes(shown, questions)
         sizes = list(zip(self._prompter.lengths(questions), map(len, said), shapes, strict=True))
         # Equal sizes need no padding, so hooks see only real tokens.
         parts: list[list[int]] = []
@@ -407,8 +407,8 @@ class HFBackbone(Backbone):
             parts += [rows[start : start + together] for start in range(0, len(rows), together)]
 
         def prepare(part: list[int]) -> Batch:
-            shown = [images[i] for i in image_of[part].tolist()]
-            prompts = self._prompter.process(shown, [questions[i] for i in part], "right")
+            own, asked = [shown[i] for i in part], [questions[i] for i in part]
+            prompts = self._prompter.process(own, asked, "right")
             return self._prompter.extend(prompts, [said[i] for i in part])
 
         with prefetch.for_device(prepare, parts, self.device) as prepared:
