@@ -164,6 +164,20 @@ class Prompter:
             type_ids[:, :length] = batch.extra[name]
         return Batch(batch.pixels, ids, mask, {**batch.extra, **types})
 
+    @staticmethod
+    def padded_left(batch: Batch) -> Batch:
+        """The same batch, with the padding on the left, which was on the right."""
+        length = batch.ids.shape[1]
+        tokens = batch.mask.sum(1, keepdim=True)
+        # The first number after a row's tokens, its first padding, comes to its beginning.
+        places = (torch.arange(length, device=tokens.device) + tokens) % length
+        extra = {
+            name: t.gather(1, places) if t.shape == batch.ids.shape else t
+            for name, t in batch.extra.items()
+        }
+        ids, mask = batch.ids.gather(1, places), batch.mask.gather(1, places)
+        return Batch(batch.pixels, ids, mask, extra)
+
     def _prompt(self, text: str, images: int = 1) -> str:
         if self._family.prompt is not None:
             return _IMAGE * images + self._family.prompt.format(text)
