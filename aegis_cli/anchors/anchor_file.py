@@ -12,6 +12,7 @@ import shlex
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import torch
@@ -19,9 +20,11 @@ from torch import Tensor
 
 from aegis_cli.anchors.second_moments import shared
 from aegis_cli.common import artifacts, commands
+from aegis_cli.common.errors import AegisError
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.moments import Moments
 from aegis_cli.core.spectrum import Spectrum, orthonormal, with_rest
+from aegis_cli.models.backbones import preparation
 
 TYPES = ("image", "text")
 _SPECTRA = ("inputs", "curvature")
@@ -115,21 +118,36 @@ class Wanted:
         option: how the command takes another one, as the beginning of words, such as `--base `.
         measuring: the command that measures its anchor; None: with the settings of the anchor that
             was given; empty: its own anchor is of no use here.
+        prepares: the settings by which the backbone's inputs are made; an anchor that names none of
+            them is read too.
     """
 
     fingerprint: str
     name: str
     option: str
     measuring: str | None = None
+    prepares: Mapping[str, str] = MappingProxyType({})
 
 
 def load(path: Path, wanted: Wanted) -> Anchor:
     """Read the anchor of a backbone.
 
     Raises:
-        AegisError: no anchor, a damaged one, or that of another backbone.
+        AegisError: no anchor, a damaged one, that of another backbone, or one of inputs that were
+            made by other settings.
     """
-    return from_artifact(artifacts.load(path, "anchor", owner=_owner(path, wanted)))
+    artifact = artifacts.load(path, "anchor", owner=_owner(path, wanted))
+    other = preparation.differing(wanted.prepares, artifact.header.meta.get(preparation.META, {}))
+    if other is not None:
+        raise AegisError(
+            f"a backbone that makes its inputs of images and texts otherwise than when the anchor "
+            f"'{path}' was measured: {other}",
+            "the same settings of the processor, since the anchor describes what the weights do "
+            "with these inputs",
+            "measure the anchor again with aegis anchor, or bring the settings back in the "
+            "model's folder (e.g. in its preprocessor_config.json)",
+        )
+    return from_artifact(artifact)
 
 
 def _owner(path: Path, wanted: Wanted) -> artifacts.Owner:

@@ -27,6 +27,7 @@ from aegis_cli.data.vqa import digests, sets
 from aegis_cli.data.vqa.dataset import VQASet
 from aegis_cli.data.vqa.images import tensors
 from aegis_cli.models import backbones
+from aegis_cli.models.backbones import preparation
 from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.recipes import Anchor as Settings
 
@@ -173,6 +174,7 @@ def _written(measured: _Measured, backbone: str, settings: Settings, out: Path) 
         meta={
             artifacts.BACKBONE: backbone,
             **measured.meta,
+            **({preparation.META: dict(measured.prepares)} if measured.prepares else {}),
             "samples": measured.samples,
             "parts": sorted(set(settings.parts)),
             "energy": settings.energy,
@@ -202,6 +204,7 @@ class _Measured:
     """An anchor and what its file says about it.
 
     Attributes:
+        prepares: the settings by which the backbone makes its inputs.
         inputs: name -> sha256 of the data it was measured on.
         meta: how that data is named in the file's header.
         work: the progress that is saved until the anchor is written.
@@ -210,6 +213,7 @@ class _Measured:
 
     anchor: Anchor
     fingerprint: str
+    prepares: Mapping[str, str]
     samples: int
     skipped: int
     seconds: dict[str, float]
@@ -246,6 +250,7 @@ def _on_questions(
     return _Measured(
         anchor,
         fingerprint=fingerprint,
+        prepares=model.preparation(),
         samples=len(asked.questions),
         skipped=asked.skipped,
         seconds=seconds,
@@ -324,6 +329,7 @@ def _on_frames(
     return _Measured(
         Anchor(image, text),
         fingerprint=fingerprint,
+        prepares=model.preparation(),
         samples=len(frames),
         skipped=0,
         seconds={"moments": work.before_s + time.perf_counter() - start},

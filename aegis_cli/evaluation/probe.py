@@ -25,6 +25,7 @@ from aegis_cli.data.vqa.metrics import Graded, by_family, drop_interval, predict
 from aegis_cli.evaluation import kept_answers, results, wrong_answers
 from aegis_cli.models import backbones
 from aegis_cli.models.asking import ask
+from aegis_cli.models.backbones import preparation
 from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.training import checkpoint
 from aegis_cli.training.folder import METRICS
@@ -139,6 +140,7 @@ def run(
     model = loaded.model
     before = None if reference_model is None else reference_model.model
     if before is not None:
+        check_preparation(target, baseline, model, before, max_drop, "probe", on_event)
         _warn_of_another_start(target, baseline, before, on_event)
     measured = None if anchor is None else _anchor(anchor, target, model, baseline, before)
     # Both models have to read every question, since the drop compares the same questions.
@@ -265,6 +267,41 @@ def warn_of_few_questions(
     on_event(Warned(stage, text))
 
 
+def check_preparation(
+    target: str,
+    baseline: str | None,
+    model: Backbone,
+    before: Backbone,
+    max_drop: float | None,
+    stage: str,
+    on_event: OnEvent,
+) -> None:
+    """Warn if two models make different inputs of the same questions.
+
+    Raises:
+        AegisError: they do, and a gate would judge the training by the drop.
+    """
+    other = preparation.differing(model.preparation(), before.preparation())
+    if other is None:
+        return
+    found = (
+        f"'{target}' prepares images or text otherwise than its baseline '{baseline}' does: {other}"
+    )
+    fix = (
+        "give both the same files of the processor (e.g. preprocessor_config.json; a run has its "
+        "own in checkpoints/last/backbone)"
+    )
+    if max_drop is not None:
+        raise AegisError(
+            found,
+            f"the same settings for a gate (--max-drop {max_drop:g}), which judges what the "
+            "training has cost",
+            fix,
+        )
+    text = f"{found}. So a drop is not that of the weights alone: {fix}"
+    on_event(Warned(stage, text))
+
+
 def _warn_of_another_start(
     target: str, baseline: str | None, before: Backbone, on_event: OnEvent
 ) -> None:
@@ -323,7 +360,9 @@ def answers(
         graded = ask(model, asked, batch_size, on_event, ranks)
         layers = []
         if anchor is not None:
-            layers = drift(model, asked, anchor_file.load(*anchor), batch_size, ranks)
+            path, wanted = anchor
+            known = anchor_file.load(path, replace(wanted, prepares=model.preparation()))
+            layers = drift(model, asked, known, batch_size, ranks)
     return Answers(graded, layers, model.image_size)
 
 
@@ -336,9 +375,13 @@ def _anchor(
     """
     if baseline is None or before is None:
         # Its own anchor is no help: the drift from that is none.
-        wanted = anchor_file.Wanted(model.fingerprint(), target, "--baseline ", "")
+        wanted = anchor_file.Wanted(
+            model.fingerprint(), target, "--baseline ", "", model.preparation()
+        )
     else:
-        wanted = anchor_file.Wanted(before.fingerprint(), baseline, "--baseline ")
+        wanted = anchor_file.Wanted(
+            before.fingerprint(), baseline, "--baseline ", prepares=before.preparation()
+        )
     measured = anchor_file.load(path, wanted)
     if not measured.image:
         fix = "measure it: aegis anchor --parts moments"

@@ -133,6 +133,9 @@ def _merge(
         check_strength(settings.method, each)
     source = sources.find(target, settings, on_event)
     sources.check_moved(source)
+    probe.check_preparation(
+        target, source.base_name, source.backbone, source.base, max_drop, "merge", on_event
+    )
     # Before any weight is changed, since the task's factors belong to the fine-tuned weights.
     keep = rules.keep(source, settings, on_event)
     displacement = Displacement(source.backbone, source.base, keep)

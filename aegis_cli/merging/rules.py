@@ -70,7 +70,10 @@ def _given(path: Path, source: Source, settings: MergeSettings, part: str) -> An
     Raises:
         AegisError: no anchor, an anchor of another model, or one without the part.
     """
-    wanted = anchor_file.Wanted(source.base.fingerprint(), source.base_name, "--base ")
+    base = source.base
+    wanted = anchor_file.Wanted(
+        base.fingerprint(), source.base_name, "--base ", prepares=base.preparation()
+    )
     found = anchor_file.load(path, wanted)
     if not getattr(found, part):
         raise AegisError(

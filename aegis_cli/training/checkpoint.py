@@ -35,7 +35,7 @@ from aegis_cli.data.lerobot import layout
 from aegis_cli.data.relative import of_meta as relative_of
 from aegis_cli.methods.base import Method
 from aegis_cli.models import backbones, download, lerobot_folder, policy_meta, structure
-from aegis_cli.models.backbones import model_folder
+from aegis_cli.models.backbones import model_folder, preparation
 from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.models.expert import ActionExpert, ExpertShape, check_fit
 from aegis_cli.models.policy import Policy
@@ -137,6 +137,8 @@ def save(
         averaged: a context in which the policy has the weights that its users load.
     """
     described = {**meta, "step": step, optimizer_state.STATELESS: state.stateless}
+    if settings := policy.backbone.preparation():
+        described[preparation.META] = dict(settings)
     target = folder / "checkpoints" / f"{step:06d}"
     link = target.with_name(LAST)
 

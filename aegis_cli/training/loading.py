@@ -10,8 +10,6 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, cast
 
-import torch
-
 from aegis_cli import recipes, sim
 from aegis_cli.anchors import anchor_file
 from aegis_cli.common import artifacts, devices, launch
@@ -80,7 +78,7 @@ def load(
     backbone = backbones.load(recipe.backbone).to("cpu" if shards else device)
     fingerprint = backbone.fingerprint()
     watched = WatchedFiles([] if anchor is None else [anchor])
-    measured = None if anchor is None else _measured(anchor, fingerprint, recipe, method, device)
+    measured = None if anchor is None else _measured(anchor, backbone, fingerprint, recipe, method)
     _check_parts(method, measured, recipe)
     # Last, since this may decode hours of video.
     recorded = _demonstrations(recipe, backbone, demos, on_event, ranks)
@@ -248,13 +246,15 @@ def check_cameras(backbone: Backbone, recipe: Recipe | RobotStreamRecipe) -> Non
 
 
 def _measured(
-    path: Path, fingerprint: str, recipe: Recipe, method: Method, device: torch.device
+    path: Path, backbone: Backbone, fingerprint: str, recipe: Recipe, method: Method
 ) -> Anchor:
     """The parts of the anchor that the method reads."""
     measuring = _measuring(recipe, sorted(method.needs)) if method.needs else None
-    wanted = anchor_file.Wanted(fingerprint, recipe.backbone, "--set backbone=", measuring)
+    wanted = anchor_file.Wanted(
+        fingerprint, recipe.backbone, "--set backbone=", measuring, backbone.preparation()
+    )
     found = anchor_file.only(anchor_file.load(path, wanted), method.needs)
-    return anchor_file.to_device(found, device)
+    return anchor_file.to_device(found, devices.pick())
 
 
 def _check_parts(method: Method, anchor: Anchor | None, recipe: Recipe) -> None:

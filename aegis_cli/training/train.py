@@ -41,6 +41,7 @@ from aegis_cli.data.vqa.metrics import Graded
 from aegis_cli.methods.base import Parts
 from aegis_cli.methods.known_parameters import check_row
 from aegis_cli.models import flow, structure
+from aegis_cli.models.backbones import preparation
 from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.models.buffers import WrittenBuffers
 from aegis_cli.models.policy import Policy
@@ -334,6 +335,7 @@ def _restore(run: TrainingRun, places: inputs.Inputs) -> tuple[int, Window]:
         saved = artifacts.read_header(state, "training-state")
     if saved.inputs != run.inputs:
         raise _other_inputs(run, saved.inputs, places)
+    _check_preparation(run, saved.meta)
     kept = artifacts.load(run.out / LEDGER, "ledger")
     lines = folder.read_metrics(run.out, *_LOGGED)
     with _reading_state(run.out):
@@ -410,6 +412,20 @@ def _differing_places(
         else:
             moved.append(f"'{now}' instead of '{before}'")
     return changed, moved
+
+
+def _check_preparation(run: TrainingRun, meta: Mapping[str, Any]) -> None:
+    """Raise AegisError if the backbone would make other inputs of images and texts than before."""
+    now, then = run.policy.backbone.preparation(), meta.get(preparation.META, {})
+    other = preparation.differing(now, then)
+    if other is not None:
+        raise AegisError(
+            f"'{run.recipe.backbone}' prepares images or text otherwise than when the run in "
+            f"'{run.out}' began: {other}",
+            "the same settings of the processor",
+            "bring them back in the model's folder (e.g. in its preprocessor_config.json), or "
+            "start anew in another --out",
+        )
 
 
 @contextmanager

@@ -308,7 +308,8 @@ def smolvla_moves_orthogonally(folder: Path) -> str:
     )
     end = train_smolvla(folder, start, "orthogonal", options)
     base = backbones.load(str(folder / "vlm"))
-    measured = anchor_file.load(anchor, base.fingerprint())
+    wanted = anchor_file.Wanted(base.fingerprint(), str(folder / "vlm"), "--base ")
+    measured = anchor_file.load(anchor, wanted)
     before, after = tensors_of(start.parent / start.name), tensors_of(end)
     inside = "model.vlm_with_expert."  # whose VLM is named as ours: vlm.
     moved = {

@@ -31,6 +31,7 @@ from aegis_cli.models.backbones.prompting import Processors
 
 Loaded = Callable[[str], HFBackbone]  # by a family's name
 SAID = ["red", "two", "x3 y5", ""]
+TOWERS = ("visual", "vision_tower", "vision_model")  # by their names in the families
 MAX_ANSWER = 10  # tokens that a model may generate here, fewer than usual
 
 
@@ -464,6 +465,51 @@ def test_what_threads_prepare_is_answered_and_read_alike(
         assert said == backbone.answer(*asked[:2])
         assert torch.equal(likelihood, again)
     assert torch.equal(one_scores, other_scores)
+
+
+def test_padding_on_the_left_is_as_the_processor_has_it(backbone: HFBackbone) -> None:
+    for texts in (TEXTS, TEXTS[:1] * 4):
+        right, wanted = (backbone._prompter.process(images(4), texts, s) for s in ("right", "left"))
+        found = backbone._prompter.padded_left(right)
+        assert torch.equal(found.ids, wanted.ids) and torch.equal(found.mask, wanted.mask)
+        assert torch.equal(found.pixels, wanted.pixels)
+        assert found.extra.keys() == wanted.extra.keys()
+        assert all(torch.equal(found.extra[name], own) for name, own in wanted.extra.items())
+
+
+@torch.no_grad()
+def test_an_image_is_processed_and_seen_once_for_its_answer_and_its_likelihood(
+    backbone: HFBackbone, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Both are, bit for bit, those of a pass of their own for each."""
+    shown = images(4)
+    wanted = backbone.answer(shown, TEXTS), backbone.answer_log_likelihood(shown, TEXTS, SAID)
+    processed, seen = [], []
+    process, model = backbone._prompter.process, backbone.vlm.base_model
+    monkeypatch.setattr(
+        backbone._prompter, "process", lambda *a: processed.append(len(a[0])) or process(*a)
+    )
+    tower = next(m for name, m in model.named_modules() if name in TOWERS)
+    tower.register_forward_hook(lambda *_: seen.append(1))
+    ((answers, likelihoods),) = backbone.answers([(shown, TEXTS, SAID)])
+    assert processed == [4] and seen == [1]
+    assert answers == wanted[0] and torch.equal(likelihoods, wanted[1])
+    other = images(4, seed=5)  # no feature is left behind for the next batch
+    ((answers, likelihoods),) = backbone.answers([(other, TEXTS, SAID)])
+    assert answers == backbone.answer(other, TEXTS)
+    assert torch.equal(likelihoods, backbone.answer_log_likelihood(other, TEXTS, SAID))
+    assert not torch.equal(likelihoods, wanted[1])
+
+
+def test_likelihoods_of_answers_have_a_graph_through_the_vision_tower(backbone: HFBackbone) -> None:
+    ((_, likelihoods),) = backbone.answers([(images(4), TEXTS, SAID)])
+    likelihoods.sum().backward()
+    in_vision = {
+        name: p.grad
+        for name, p in backbone.named_parameters()
+        if backbone.in_vision(name) and p.grad is not None
+    }
+    assert any(bool(gradient.any()) for gradient in in_vision.values())
 
 
 def test_image_tokens_are_the_processors(backbone: HFBackbone) -> None:

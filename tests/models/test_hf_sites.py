@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from samples.backbones import TEXTS, images
+from samples.hf import WITH_TORCHVISION
 from torch import Tensor, nn
 
 from aegis_cli.anchors import curvature, inputs
@@ -265,3 +266,43 @@ def test_a_pass_takes_no_more_questions_than_asked_for(
     found = read(together)
     assert sizes == ([1] * 7 if together == 1 else [3, 3, 1])
     torch.testing.assert_close(found, wanted, rtol=1e-4, atol=1e-4)
+
+
+# Families that make several shapes of the sizes below: of tiles, or of tiles without their borders.
+PASSES = {"llava_onevision": 3, "llava_next": 3, "internvl": 2}
+SIZES = [(48, 64), (64, 48), (43, 64), (64, 43), (50, 64), (40, 48)]  # height and width
+
+
+def of_sizes() -> tuple[list[Tensor], Tensor, list[str], list[str]]:
+    """Noise of six sizes with one question each, and all that `read_vqa` is given for them."""
+    generator = torch.Generator().manual_seed(0)
+    shown = [
+        torch.randint(256, (*size, 3), generator=generator, dtype=torch.uint8) for size in SIZES
+    ]
+    return shown, torch.arange(len(SIZES)), TEXTS[:1] * len(SIZES), SAID[:1] * len(SIZES)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("name", FAMILIES)
+def test_images_of_many_sizes_share_a_pass_if_the_processor_makes_the_same_shape(
+    name: str, hf_backbone: Loaded, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The scores are those of a pass for each image, and no token of a pass is padding."""
+    backbone, given, passed = hf_backbone(name), of_sizes(), []
+    alone = list(backbone.read_vqa(*given, together=1))
+    inner = backbone._scores
+    monkeypatch.setattr(
+        backbone, "_scores", lambda batch, last: passed.append(batch) or inner(batch, last)
+    )
+    parts = list(backbone.read_vqa(*given))
+    assert all(batch.mask.all() for batch in passed)
+    assert len(passed) == PASSES.get(name, 1) or name in WITH_TORCHVISION
+    numbers, found, wanted = (
+        torch.cat([part.question for part in parts]),
+        torch.cat([part.scores for part in parts]),
+        torch.cat([part.scores for part in alone]),
+    )
+    assert torch.equal(numbers, torch.cat([part.question for part in alone]))
+    torch.testing.assert_close(found, wanted, rtol=1e-4, atol=1e-4)
+    again = torch.cat([part.scores for part in backbone.read_vqa(*given)])
+    assert torch.equal(found, again)  # an interrupted measurement goes on with the same passes

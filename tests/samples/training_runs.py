@@ -156,8 +156,10 @@ def protected_shares(out: Path, anchor: Path, energy: float) -> list[float]:
         anchor: file with the inputs of the backbone with which the run began.
         energy: share of the inputs' energy that the directions hold.
     """
-    origin = backbones.load(recipes.load(out / "recipe.yaml").backbone)
-    measured = anchor_files.load(anchor, origin.fingerprint())
+    named = recipes.load(out / "recipe.yaml").backbone
+    origin = backbones.load(named)
+    wanted = anchor_files.Wanted(origin.fingerprint(), named, "--backbone ")
+    measured = anchor_files.load(anchor, wanted)
     saved = [path for path in sorted((out / "checkpoints").iterdir()) if not path.is_symlink()]
     found = [checkpoint.load_policy(path)[0].backbone for path in saved]
     return [share_of_displacement(then, origin, measured, energy) for then in found]

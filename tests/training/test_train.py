@@ -358,7 +358,8 @@ def test_a_constraint_covers_all_the_steps_since_the_last(
 
 def test_kfac_reads_the_curvature_alone(start: Start, anchor_file: Path, tmp_path: Path) -> None:
     fingerprint = make_tiny().fingerprint()
-    curvature = anchor_files.load(anchor_file, fingerprint).curvature
+    wanted = anchor_files.Wanted(fingerprint, "tiny", "--backbone ")
+    curvature = anchor_files.load(anchor_file, wanted).curvature
     anchor_files.save(
         tmp_path / "alone.safetensors",
         Anchor(curvature=curvature),

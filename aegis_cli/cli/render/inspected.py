@@ -113,8 +113,9 @@ def _from_to(least: int, most: int) -> str:
 def _as_they_are_read(facts: Mapping[str, Any]) -> dict[str, Any]:
     """The facts as shown: a run's steps with the planned number if some are left, and its merge."""
     planned, steps = facts.get("planned_steps"), facts.get("steps")
-    # "shared" is left out because an anchor's maps with a shared spectrum are rows of its table.
-    apart = ("planned_steps", "measured_before", "shared")
+    # "shared" is left out because an anchor's maps with a shared spectrum are rows of its table,
+    # and "prepares" because it has all settings of a processor.
+    apart = ("planned_steps", "measured_before", "shared", "prepares")
     left = {name: value for name, value in facts.items() if name not in apart}
     merged = facts.get("merge")
     if merged:

@@ -266,6 +266,13 @@ class Backbone(nn.Module, ABC):
         """Digests of what, besides weights and code, affects how inputs are read; none here."""
         return {}
 
+    def preparation(self) -> Mapping[str, str]:
+        """The settings that decide what inputs images and texts become (preparation.py); none here.
+
+        The embedded models' inputs depend on their code alone.
+        """
+        return {}
+
     def suffix(self, encoding: Encoding, count: int) -> Suffix:
         """How `count` tokens that follow the encoding see it; here, everything but padding."""
         return Suffix(encoding.mask)

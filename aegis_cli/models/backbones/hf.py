@@ -7,6 +7,7 @@ clip.py and from_hub.py import transformers.
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import inspect
 import shutil
@@ -122,6 +123,9 @@ class HFBackbone(Backbone):
         contents = {"config.json": self.vlm.config.to_json_string().encode(), **self._files}
         digests = {name: hashlib.sha256(own).hexdigest() for name, own in contents.items()}
         return {"ends": str(self.vlm.generation_config.eos_token_id), **digests}
+
+    def preparation(self) -> Mapping[str, str]:
+        return self._prompter.preparation
 
     def _measure_keys(self) -> tuple[int, int]:
         """The number and size of the key heads, from a pass over one black image.
@@ -290,11 +294,9 @@ class HFBackbone(Backbone):
         self, images: Images, questions: Sequence[str], most: int | None = None
     ) -> list[str]:
         tokens = MAX_ANSWER if most is None else most
-        return self._generated(self._to_answer(images, questions), [tokens] * len(questions))
-
-    def _to_answer(self, images: Images, questions: Sequence[str]) -> Batch:
         # Padding on the left, so that generated tokens directly follow each prompt.
-        return self._prompter.process(images, questions, "left")
+        prompts = self._prompter.process(images, questions, "left")
+        return self._generated(prompts, [tokens] * len(questions))
 
     @torch.no_grad()
     def _generated(self, prompts: Batch, most: Sequence[int]) -> list[str]:
@@ -307,17 +309,23 @@ class HFBackbone(Backbone):
         return self._prompter.decode([row[:own] for row, own in zip(rows, most, strict=True)])
 
     def answers(self, batches: Iterable[Asked]) -> Iterator[tuple[list[str], Tensor]]:
-        """See `Backbone.answers`; on a GPU, the next batches are prepared at the same time."""
+        """See `Backbone.answers`; on a GPU, the next batches are prepared at the same time.
+
+        Each image is processed once, and without gradients the vision tower reads it once.
+        """
 
         def prepare(asked: Asked) -> tuple[Batch, _Answered]:
-            images, questions, _ = asked
-            return self._to_answer(images, questions), self.prepare_answers(*asked)
+            images, questions, answers = asked
+            prompts = self._prompter.process(images, questions, "right")
+            return self._prompter.padded_left(prompts), self._answered(prompts, answers)
 
         with prefetch.for_device(prepare, batches, self.device) as prepared:
             for prompts, answered in prepared:
                 # One more than the reference, so that a longer answer does not match it.
                 most = [max(MAX_ANSWER, len(said) + 1) for said in answered.said]
-                yield self._generated(prompts, most), self._log_likelihood(answered)
+                with _features_once(self.vlm.base_model):
+                    found = self._generated(prompts, most), self._log_likelihood(answered)
+                yield found
 
     def check_prompt(self, text: str) -> None:
         self._prompter.check_text(text)
@@ -345,9 +353,11 @@ class HFBackbone(Backbone):
     def prepare_answers(
         self, images: Images, questions: Sequence[str], answers: Sequence[str]
     ) -> _Answered:
+        return self._answered(self._prompter.process(images, questions, "right"), answers)
+
+    def _answered(self, prompts: Batch, answers: Sequence[str]) -> _Answered:
         """Prompts followed by their answers, on the CPU: reading lengths from a GPU would wait."""
         said = self._prompter.answer_ids(answers)
-        prompts = self._prompter.process(images, questions, "right")
         lengths = prompts.mask.sum(1).tolist()
         asked = self._prompter.padded(self._prompter.extend(prompts, said), self._multiple)
         return _Answered(asked, lengths, said)
@@ -394,8 +404,8 @@ class HFBackbone(Backbone):
     ) -> Iterator[AnswerScores]:
         """See `Backbone.read_vqa`; an image is passed per question, which may affect its states."""
         said = self._prompter.answer_ids(answers)
-        # Shapes matter because images of different sizes may become different numbers of tokens.
-        shapes = [tuple(images[i].shape) for i in image_of.tolist()]
+        shown = [images[i] for i in image_of.tolist()]
+        shapes = self._prompter.shapes(shown, questions)
         sizes = list(zip(self._prompter.lengths(questions), map(len, said), shapes, strict=True))
         # Equal sizes need no padding, so hooks see only real tokens.
         parts: list[list[int]] = []
@@ -404,8 +414,8 @@ class HFBackbone(Backbone):
             parts += [rows[start : start + together] for start in range(0, len(rows), together)]
 
         def prepare(part: list[int]) -> Batch:
-            shown = [images[i] for i in image_of[part].tolist()]
-            prompts = self._prompter.process(shown, [questions[i] for i in part], "right")
+            own, asked = [shown[i] for i in part], [questions[i] for i in part]
+            prompts = self._prompter.process(own, asked, "right")
             return self._prompter.extend(prompts, [said[i] for i in part])
 
         with prefetch.for_device(prepare, parts, self.device) as prepared:
@@ -497,6 +507,31 @@ def _head_at(head: nn.Module, rows: Tensor, columns: Tensor) -> Generator[None]:
         yield
     finally:
         handle.remove()
+
+
+@contextmanager
+def _features_once(model: nn.Module) -> Generator[None]:
+    """Inside the block, whose passes are all about the same images, their features are made once.
+
+    With gradients they are made in every pass, since each backward pass needs a graph of its own.
+    """
+    make: Any = getattr(model, "get_image_features", None)
+    if make is None or torch.is_grad_enabled():
+        yield
+        return
+    made: list[Any] = []
+
+    @functools.wraps(make)  # `generate` reads from its signature what to give it
+    def once(*given: Any, **named: Any) -> Any:
+        if not made:
+            made.append(make(*given, **named))
+        return made[0]
+
+    model.get_image_features = once  # type: ignore[assignment]
+    try:
+        yield
+    finally:
+        del model.get_image_features  # the class's own is behind it
 
 
 @contextmanager

@@ -10,7 +10,8 @@ import copy
 import textwrap
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager
-from typing import Any
+from functools import cached_property
+from typing import Any, NamedTuple
 
 import torch
 from PIL import Image
@@ -18,6 +19,7 @@ from torch import Tensor
 
 from aegis_cli.common.errors import AegisError, in_short
 from aegis_cli.data.batch import Images
+from aegis_cli.models.backbones import preparation
 from aegis_cli.models.backbones.base import Batch
 from aegis_cli.models.backbones.families import Family
 from aegis_cli.models.backbones.model_folder import misfit
@@ -56,6 +58,21 @@ class Processors:
             self._idle.append(processor)
 
 
+class Shape(NamedTuple):
+    """What a processor makes of an image.
+
+    Attributes:
+        tokens: how many it adds to a prompt.
+        tensors: the names and shapes of its tensors, except those with a number per token.
+    """
+
+    tokens: int
+    tensors: tuple[tuple[str, tuple[int, ...]], ...]
+
+
+_ANY = Shape(0, ())  # of images that all have one size
+
+
 class Prompter:
     """A processor with the prompt format of its family."""
 
@@ -70,6 +87,13 @@ class Prompter:
         self._longest, self._words = longest, words
         self._tokenizer = processor.tokenizer  # of the original
         self._markers = _markers(processor, image_token)
+        self._shapes: dict[tuple[int, ...], Shape] = {}  # by the size of an image
+
+    @cached_property
+    def preparation(self) -> dict[str, str]:
+        """The processor's settings; see preparation.py."""
+        with self._processors.one() as processor:
+            return preparation.of(processor)
 
     def process(self, images: Images, prompts: Sequence[str], side: str) -> Batch:
         """Prompts with one or several images [H, W, 3] uint8 of any size each, padded on `side`.
@@ -139,6 +163,20 @@ class Prompter:
         for name, type_ids in types.items():
             type_ids[:, :length] = batch.extra[name]
         return Batch(batch.pixels, ids, mask, {**batch.extra, **types})
+
+    @staticmethod
+    def padded_left(batch: Batch) -> Batch:
+        """The same batch, with the padding on the left, which was on the right."""
+        length = batch.ids.shape[1]
+        tokens = batch.mask.sum(1, keepdim=True)
+        # The first number after a row's tokens, its first padding, comes to its beginning.
+        places = (torch.arange(length, device=tokens.device) + tokens) % length
+        extra = {
+            name: t.gather(1, places) if t.shape == batch.ids.shape else t
+            for name, t in batch.extra.items()
+        }
+        ids, mask = batch.ids.gather(1, places), batch.mask.gather(1, places)
+        return Batch(batch.pixels, ids, mask, extra)
 
     def _prompt(self, text: str, images: int = 1) -> str:
         if self._family.prompt is not None:
@@ -224,6 +262,29 @@ class Prompter:
         with self._processors.one() as processor:
             rows = processor.tokenizer(asked)["input_ids"]
         return [len(ids) for ids in rows]
+
+    def shapes(self, images: Sequence[Tensor], prompts: Sequence[str]) -> list[Shape]:
+        """What the processor makes of each image [H, W, 3], of which only the size matters.
+
+        Images of equal shapes need no padding in one batch. Many sizes may have one shape: a
+        processor usually scales images, and may cut them into tiles. An image of each size is
+        processed once, unless all have one size.
+        """
+        sizes = [tuple(image.shape) for image in images]
+        if len(set(sizes)) == 1:
+            return [_ANY] * len(sizes)
+        for size, image, text in zip(sizes, images, prompts, strict=True):
+            if size not in self._shapes:
+                made = self.process([image], [text], "right")
+                tokens = made.ids.shape[1] - self.lengths([text])[0]
+                tensors = {"pixels": made.pixels, **made.extra}
+                of_image = [
+                    (name, tuple(tensor.shape))
+                    for name, tensor in sorted(tensors.items())
+                    if tensor.shape != made.ids.shape  # those per token are as long as the text
+                ]
+                self._shapes[size] = Shape(tokens, tuple(of_image))
+        return [self._shapes[size] for size in sizes]
 
     def extend(self, batch: Batch, said: Sequence[Sequence[int]]) -> Batch:
         """Each row followed by its answer's tokens, padded on the right again."""
