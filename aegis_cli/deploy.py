@@ -16,9 +16,10 @@ demonstrations.
 from __future__ import annotations
 
 import copy
+import logging
 import threading
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -33,6 +34,7 @@ from aegis_cli.continual import robots
 from aegis_cli.core import ensemble as temporal
 from aegis_cli.core.continuation import Continued
 from aegis_cli.core.ensemble import TemporalEnsemble
+from aegis_cli.data.far_positions import FarPositions
 from aegis_cli.data.lerobot import layout, observation
 from aegis_cli.data.selection import listed
 from aegis_cli.evaluation.rollout import load_run
@@ -44,6 +46,7 @@ from aegis_cli.training import checkpoint
 _ORDER = "the order is: pictures, instruction, positions"
 Pictures = np.ndarray | Mapping[str, np.ndarray]
 Positions = Sequence[float] | np.ndarray
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -95,7 +98,8 @@ class DeployedPolicy:
 
         Args:
             recorded: what a checkpoint's meta says of the demonstrations: `action_names`,
-                `proprio_names`, `state` and `fps`, each only if it is known.
+                `proprio_names`, `state`, `fps`, `normalization` and `proprio_reach`, each only if
+                it is known.
             ensemble: decay of a temporal ensemble; `replan` is then always 1.
         """
         self._policy, self._generator = policy, torch.Generator()
@@ -109,6 +113,13 @@ class DeployedPolicy:
         self.state_names = _names(known.get("proprio_names"))
         self.state = tuple(listed(known.get("state", layout.STATE)))
         self.fps: float | None = known.get("fps")
+        self._far = FarPositions(
+            policy.proprio_scale,
+            self.state_names,
+            known.get("normalization", "mean_std"),
+            known.get("proprio_reach"),
+        )
+        self._tell: Callable[[str], object] = _log.warning
         # A backbone records what its modules do in a pass, and would mix up two at once.
         self._one_at_a_time = threading.Lock()
         self.reset()
@@ -134,13 +145,18 @@ class DeployedPolicy:
         """Raise AegisError for an instruction that the backbone cannot read."""
         self._policy.backbone.check_prompt(text)
 
-    def begin(self) -> DeployedPolicy:
+    def begin(self, tell: Callable[[str], object] | None = None) -> DeployedPolicy:
         """The same policy at the start of a separate episode; the weights are shared.
 
         Several of them may be used from several threads; they wait for each other.
+
+        Args:
+            tell: called with a warning about positions far from those of the training; None: the
+                warning is logged.
         """
         other = copy.copy(self)
-        other._generator = torch.Generator()
+        other._generator, other._far = torch.Generator(), self._far.anew()
+        other._tell = _log.warning if tell is None else tell
         other.reset()
         return other
 
@@ -302,6 +318,9 @@ class DeployedPolicy:
     ) -> Seen:
         """The input of `predict`, from the same arguments as `predict_action_chunk`.
 
+        Warns once of each position that is far from those of the training, which may be in other
+        units.
+
         Raises:
             AegisError: pictures or numbers differ from those the policy was trained on.
         """
@@ -338,6 +357,8 @@ class DeployedPolicy:
         several = len(self.cameras) > 1
         names = [f" of {name}" for name in self.cameras] if several else [""]
         found = [_picture(of, picture) for of, picture in zip(names, shown, strict=True)]
+        if (far := self._far.notice(given)) is not None:
+            self._tell(far)
         return Seen(found, instruction, given)
 
     def _in_order(self, pictures: Pictures) -> list[np.ndarray]:
@@ -474,19 +495,22 @@ def _of_stream(
     run = robots.load_to_act(folder)
     policy = run.policies[number]
     policy.acts_in = acts_in
+    view, normalization = run.views[number], run.recipe.train.normalization
     if run.recipe.simulated:
         found = run.acting(number)
         # A single picture needs no name.
         cameras = found.cameras if len(found.cameras) > 1 else ()
+        known = {"normalization": normalization, "proprio_reach": view.get("proprio_reach")}
         return DeployedPolicy(
-            policy.to(device), found.task, cameras, found.replan, seed, found.sizes, None, ensemble
+            policy.to(device), found.task, cameras, found.replan, seed, found.sizes, known, ensemble
         )
     run.activate(number)
-    view, replan = run.views[number], run.recipe.rollout.replan
+    replan = run.recipe.rollout.replan
     cameras = view.get("cameras", ())
     sizes = checkpoint.sizes_of(view)
+    known = {**view, "normalization": normalization}
     return DeployedPolicy(
-        policy.eval().to(device), None, cameras, replan, seed, sizes, view, ensemble
+        policy.eval().to(device), None, cameras, replan, seed, sizes, known, ensemble
     )
 
 

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from samples import lerobot
 from samples.small_run import recipe
 from samples.training import images, make_policy
 
@@ -121,6 +122,46 @@ def test_an_older_checkpoint_has_neither_names_nor_rate() -> None:
     assert (own.action_names, own.state_names, own.fps) == (None, None, None)
 
 
+def test_positions_in_other_units_are_warned_of_once_and_acted_on(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    own = deployed(recorded={"proprio_names": ["pan.pos", "lift.pos", "grip.pos"]})
+    own.select_action(frame(), TEXT, POSITIONS)
+    assert not caplog.records
+    for _ in range(3):
+        assert own.select_action(frame(), TEXT, [0.1, -2000.0, 0.2]).shape == (2,)
+        own.reset()
+    (record,) = caplog.records
+    assert record.levelname == "WARNING" and "lift.pos' is -2000" in record.message
+    assert "training mean -0.2, standard deviation 0.5" in record.message
+    own.begin().select_action(frame(), TEXT, [0.1, -2000.0, 0.2])
+    assert len(caplog.records) == 2
+
+
+def test_a_run_knows_how_far_a_joint_ever_was_that_hardly_ever_moved(
+    tiny_folder: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A gripper that closed in one frame of hundreds is far from its mean whenever it closes."""
+    rng = np.random.default_rng(0)
+    state = rng.normal(size=(3, 100, 3)).astype(np.float32)
+    state[:, :, 2] = 0.0
+    state[:, 7, 2] = 100.0
+    shown = {"top": np.zeros((100, 16, 16, 3), np.uint8)}
+    made = [lerobot.write.NewEpisode(shown, one, one[:, :2], TEXT) for one in state]
+    made += [lerobot.write.NewEpisode(shown, state[0] * [1, 1, 0], state[0, :, :2], TEXT)] * 3
+    demos = lerobot.save(tmp_path / "demos", made)
+    run = tmp_path / "run"
+    train.run(recipe(tiny_folder, steps=1, validation_share=0.2), "naive", demos, None, run)
+    export.run(run, tmp_path / "lerobot")
+    for folder in (run, tmp_path / "lerobot"):
+        own = load_policy(folder)
+        own.select_action(frame(), TEXT, [0.0, 0.0, 100.0])
+        assert not caplog.records
+        own.select_action(frame(), TEXT, [0.0, 0.0, 4096.0])
+        assert "'z' is 4096" in caplog.text
+        caplog.clear()
+
+
 def test_an_empty_picture_of_a_runs_policy_is_refused(run_folder: Path) -> None:
     own = load_policy(run_folder)
     with pytest.raises(AegisError, match=r"\(0, 640, 3\)"):
@@ -149,8 +190,12 @@ def test_of_a_stream_it_takes_a_picture_of_each_camera(
     """A single camera needs no name there either."""
     acting = Acting(make_policy().eval(), "libero/object", REPLAN, cameras)
     monkeypatch.setattr(deploy, "is_robot_stream_run", lambda _: True)
+    trained = SimpleNamespace(normalization="mean_std")
     run = SimpleNamespace(
-        recipe=SimpleNamespace(simulated=True), policies=[acting.policy], acting=lambda _: acting
+        recipe=SimpleNamespace(simulated=True, train=trained),
+        policies=[acting.policy],
+        acting=lambda _: acting,
+        views=[{}],
     )
     monkeypatch.setattr(robots, "number_of", lambda *_: 0)
     monkeypatch.setattr(robots, "load_to_act", lambda _: run)

@@ -718,8 +718,9 @@ def probe(
     baseline: Annotated[
         str | None,
         Option(
-            help="Run or backbone to measure the drop against. With a gate or --anchor it "
-            "defaults to the model that a run began from."
+            help="Run or backbone to measure the drop against; none: measure only the accuracy. "
+            "Default: the model that a run began from; without a gate or --anchor, only if it "
+            "is on this machine."
         ),
     ] = None,
     anchor: AnchorIn = None,
@@ -779,8 +780,8 @@ def probe(
         stages.PROBE_STREAM.run(Path(target), device=device, as_json=as_json)
         return
     asks = question_sets.chosen(target, vqa, ask, skip_bad, batch_size, questions, seed)
-    limit = "--max-drop"
-    if max_drop is None and asks.max_drop is not None:
+    limit, is_default = "--max-drop", baseline is None
+    if max_drop is None and asks.max_drop is not None and baseline != _NO_BASELINE:
         limit, max_drop = "the recipe's probe.max_drop", asks.max_drop
         if launch.rank() == 0:
             render.note(f"the gate is at a drop of {max_drop:g} points, {limit}")
@@ -802,6 +803,7 @@ def probe(
             ask=asks.ask,
             seed=asks.seed,
             keep=True,
+            only_if_own=is_default and max_drop is None and anchor is None,
             device=device,
             as_json=as_json,
         )
@@ -813,6 +815,9 @@ def probe(
     _end_at_gate(failed)
 
 
+_NO_BASELINE = "none"  # as --baseline
+
+
 def _drop_against(
     target: str,
     baseline: str | None,
@@ -820,7 +825,7 @@ def _drop_against(
     max_drop: float | None,
     gate: Gate | None,
 ) -> str | None:
-    """The baseline of a probe's drop; None if no drop is requested.
+    """The baseline of a probe's drop; None for a probe without one.
 
     Raises:
         AegisError: a gate without a limit, or a limit with nothing to measure the drop against.
@@ -830,8 +835,11 @@ def _drop_against(
         fix = "add --max-drop POINTS, or leave --gate out"
         raise AegisError(f"--gate {gate.value} without --max-drop", expected, fix)
     # With an anchor, the drift is shown beside that of the model before fine-tuning.
-    if baseline is None and (max_drop is not None or anchor is not None):
-        baseline = question_sets.baseline(target, anchor)
+    if baseline is None:
+        needed = max_drop is not None or anchor is not None
+        baseline = question_sets.baseline(target, anchor, needed)
+    elif baseline == _NO_BASELINE:
+        baseline = None
     if max_drop is not None and baseline is None:
         expected = "something to measure the drop against"
         raise AegisError("--max-drop without --baseline", expected, "add --baseline embedded")

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from aegis_cli.cli import render, resuming
 from aegis_cli.common import launch
+from aegis_cli.common.errors import AegisError
 from aegis_cli.recipes import Probe
 
 
@@ -44,11 +45,15 @@ def chosen(
     )
 
 
-def baseline(model: str, anchor: Path | None = None) -> str | None:
+def baseline(model: str, anchor: Path | None = None, needed: bool = True) -> str | None:
     """The default baseline for the drop of a run.
 
     It is the pre-trained VLM from which the run started, possibly through other runs, or the one
     among these models that the anchor was measured on. None for a model without a run.
+
+    Args:
+        needed: whether the drop has to be measured; otherwise None if the baseline is not on this
+            machine, with a note.
     """
     from aegis_cli.common import artifacts
     from aegis_cli.evaluation import results
@@ -63,11 +68,28 @@ def baseline(model: str, anchor: Path | None = None) -> str | None:
         # The drift is measured from the anchor's model, so the drop is too.
         origins = origins[: known[0] + 1] if known else origins
     *between, began_from = [origin.name for origin in origins]  # nearest first
+    if not needed and (lacking := _lacking(run, began_from)) is not None:
+        if launch.rank() == 0:
+            render.note(f"only the accuracy is measured, and no drop: {lacking}")
+        return None
     resuming.check_seen(run, [began_from], "probe")
     if launch.rank() == 0:
         by_way = f" by way of {', '.join(between)}" if between else ""
         render.note(f"the baseline is '{began_from}', the model that the run began from{by_way}")
     return began_from
+
+
+def _lacking(run: Path, began_from: str) -> str | None:
+    """Why a run cannot be compared with the model that it began from; None if it can."""
+    from aegis_cli.models import backbones
+
+    try:
+        resuming.check_seen(run, [began_from], "probe")
+    except AegisError as error:
+        return error.found
+    if backbones.is_here(began_from):
+        return None
+    return f"'{began_from}', the model that the run began from, is not here (--baseline names it)"
 
 
 def _of_run(model: str, asks: bool) -> tuple[Probe, ...]:

@@ -578,6 +578,9 @@ def _view(
     found = assemble.view(shown, backbone)
     if not assemble.is_spread(scales[1], recipe.train.normalization, shown):
         found["action_std"] = shown.action_std
+    reach = shown.proprio_reach(scales[0], recipe.train.normalization)
+    if reach is not None:
+        found["proprio_reach"] = reach
     if recipe.demos.rename is not None:
         found["rename"] = recipe.demos.rename
     if recipe.simulated:

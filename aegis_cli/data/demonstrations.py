@@ -19,7 +19,7 @@ from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, ignore
 from aegis_cli.common.watched_files import WatchedFiles, WatchedPaths
 from aegis_cli.data import episodes as episodes_of
-from aegis_cli.data import relative, renaming, task_episodes
+from aegis_cli.data import far_positions, relative, renaming, task_episodes
 from aegis_cli.data.batch import Images, Normalizer, RobotBatch, deviations
 from aegis_cli.data.fitted import FittedFrames
 from aegis_cli.data.joined_frames import JoinedFrames
@@ -211,6 +211,10 @@ class Demonstrations:
     def action_std(self) -> list[float]:
         """Standard deviations of the A actions over the training frames; 0 for a fixed one."""
         return deviations(self.tensors["actions"][self.train]).tolist()
+
+    def proprio_reach(self, scale: Normalizer, normalization: str) -> list[float] | None:
+        """How far the positions of the training frames ever were; see `far_positions.reach`."""
+        return far_positions.reach(self.tensors["proprio"][self.train], scale, normalization)
 
     def _relative_actions(self, chunk: int, places: relative.Places) -> Tensor:
         """Actions [N, A] of the training frames' chunks minus their origins.

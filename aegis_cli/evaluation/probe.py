@@ -110,6 +110,7 @@ def run(
     on_event: OnEvent = ignore,
     ask: str = sets.PLAIN,
     seed: int = PROBE_SEED,
+    only_if_own: bool = False,
 ) -> ProbeReport:
     """Ask `target` probe questions and, to measure the drop, `baseline` too.
 
@@ -125,6 +126,8 @@ def run(
             checkpoints.
         ask: template of the prompt, with {} for the question.
         seed: seed of the choice of questions.
+        only_if_own: leave out a baseline that is no longer the model from which `target` started,
+            with a warning; otherwise it is asked, also with a warning.
 
     Raises:
         AegisError: nothing to load, a bad question, or an anchor that does not belong to the
@@ -138,10 +141,13 @@ def run(
         loaded = kept_answers.load(target)
         reference_model = None if baseline is None else kept_answers.load(baseline)
     model = loaded.model
+    if reference_model is not None and _is_another_start(target, reference_model.model):
+        _warn_of_another_start(target, baseline, only_if_own, on_event)
+        if only_if_own:
+            reference_model = baseline = None
     before = None if reference_model is None else reference_model.model
     if before is not None:
         check_preparation(target, baseline, model, before, max_drop, "probe", on_event)
-        _warn_of_another_start(target, baseline, before, on_event)
     measured = None if anchor is None else _anchor(anchor, target, model, baseline, before)
     # Both models have to read every question, since the drop compares the same questions.
     checks = [m.check_text for m in (model, before) if m is not None]
@@ -302,20 +308,31 @@ def check_preparation(
     on_event(Warned(stage, text))
 
 
-def _warn_of_another_start(
-    target: str, baseline: str | None, before: Backbone, on_event: OnEvent
-) -> None:
-    """Warn if a run is compared with a model that neither it nor a run before it started from."""
+def _is_another_start(target: str, before: Backbone) -> bool:
+    """Whether neither a run nor a run before it started from this model; False for other targets.
+
+    A digest of billions of weights takes as long as many answers.
+    """
     folder = Path(target)
     if not folder.is_dir() or not (checkpoint.is_one(folder) or checkpoint.begun(folder)):
-        return
-    # Done last: a digest of billions of weights takes as long as many answers.
-    if before.fingerprint() not in _begun_from(folder):
+        return False
+    return before.fingerprint() not in _begun_from(folder)
+
+
+def _warn_of_another_start(
+    target: str, baseline: str | None, is_left_out: bool, on_event: OnEvent
+) -> None:
+    """Warn that a run is compared, or for that reason not compared, with another model."""
+    text = (
+        f"--baseline {baseline} is not the model that '{target}' began from: the drop is a "
+        "difference between two models, not what this training has cost"
+    )
+    if is_left_out:
         text = (
-            f"--baseline {baseline} is not the model that '{target}' began from: the drop is a "
-            "difference between two models, not what this training has cost"
+            f"only the accuracy is measured, and no drop: '{baseline}' is not the model any more "
+            f"that '{target}' began from"
         )
-        on_event(Warned("probe", text))
+    on_event(Warned("probe", text))
 
 
 def _begun_from(folder: Path) -> set[str | None]:

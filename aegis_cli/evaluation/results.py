@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import glob
 import hashlib
 import itertools
 import os
@@ -33,6 +34,9 @@ OPEN_LOOP = "evaluate"  # prefix of its files' names
 # Which episodes an open-loop evaluation used.
 VALIDATION, OTHER, CHOSEN, UNKNOWN = "validation", "other data", "chosen", "unknown"
 _PATIENCE_S = 5.0  # for other processes that write there
+# How much each kind of measurement is of: the figure that counts it.
+_COUNTS = {"probe": "questions", "rollout": "episodes", OPEN_LOOP: "frames"}
+_SMALLER = "-of-{count}-{name}"  # added to the name of one that is kept beside a larger one
 # Figures that one probe of a checkpoint has and another of the same questions may lack.
 _TOLD = {"drop_points": "drop", "passed": "gate", "layers": "drift"}
 
@@ -48,7 +52,8 @@ def keep(
 
     A later one with the same name replaces it if both used the same question set or demonstrations;
     files in different folders may have the same name. A probe with fewer figures than an earlier
-    one, such as no drop, is kept beside it, and `on_event` receives a message about that.
+    one, such as no drop, is kept beside it, and so is one of fewer questions, frames or episodes;
+    `on_event` receives a message about that.
 
     Args:
         name: `probe-scenes`, `rollout-seen` or `evaluate-validation-arm`.
@@ -76,8 +81,7 @@ def keep(
         if _is_of_other_data(path, settings):
             told_apart = hashlib.sha256(settings["path"].encode()).hexdigest()[:8]
             path = path.with_name(f"{path.stem}-{told_apart}.json")
-        if name.startswith("probe-"):
-            path = _beside_what_tells_more(path, figures, step, on_event)
+        path = _place_for(path, figures, settings, step, on_event)
         files.save_json(path, {**figures, "settings": settings, "step": step})
     recipe = recipe_of(run)
     if recipe.train.track and step is not None:
@@ -132,11 +136,63 @@ def _soon_alone(place: Path) -> Generator[None]:
 
 def _is_of_other_data(path: Path, settings: Mapping[str, Any]) -> bool:
     """Whether a file's results are for questions or demonstrations at another path."""
-    if "path" not in settings or not path.is_file():
+    if "path" not in settings:
         return False
-    found = files.load_json(path)
-    there = (found.get("settings") or {}) if isinstance(found, dict) else {}
+    there = _kept(path).get("settings") or {}
     return there.get("path", settings["path"]) != settings["path"]
+
+
+def _kept(path: Path) -> dict[str, Any]:
+    """A file's results with their settings; empty if there is no such file."""
+    found = files.load_json(path) if path.is_file() else None
+    return found if isinstance(found, dict) else {}
+
+
+def _place_for(
+    path: Path,
+    figures: Mapping[str, Any],
+    settings: Mapping[str, Any],
+    step: int | None,
+    on_event: OnEvent,
+) -> Path:
+    """Where to keep a measurement: in place of an earlier one, unless that one is worth more.
+
+    An earlier one of the same checkpoint is worth more if it is of more questions, frames or
+    episodes, or has figures that the new one lacks.
+    """
+    kind = path.stem.partition("-")[0]
+    if kind == "probe":
+        path = _beside_what_tells_more(path, figures, step, on_event)
+    name = _COUNTS[kind]
+    count, earlier = figures.get(name, 0), _kept(path)
+    if earlier.get(name, 0) <= count or earlier.get("step", step) != step:
+        _remove_smaller(path, kind, figures, settings)
+        return path
+    text = (
+        f"kept beside the earlier '{path}', which is of {earlier[name]:,} {name} and not of "
+        f"{count:,}"
+    )
+    on_event(Warned(kind, text))
+    path = path.with_name(f"{path.stem}{_SMALLER.format(count=count, name=name)}.json")
+    return _beside_what_tells_more(path, figures, step, on_event) if kind == "probe" else path
+
+
+def _remove_smaller(
+    path: Path, kind: str, figures: Mapping[str, Any], settings: Mapping[str, Any]
+) -> None:
+    """Remove what `_place_for` kept beside a measurement that a new one makes superfluous."""
+    name = _COUNTS[kind]
+
+    def asked(of: Mapping[str, Any]) -> dict[str, Any]:
+        return {key: value for key, value in of.items() if key != name}
+
+    pattern = _SMALLER.format(count="*", name=name)
+    for other in path.parent.glob(f"{glob.escape(path.stem)}{pattern}*.json"):
+        found = _kept(other)
+        is_smaller = found.get(name, 0) <= figures.get(name, 0)
+        is_same = asked(found.get("settings") or {}) == asked(settings)
+        if is_smaller and is_same and _told(found) <= _told(figures):
+            other.unlink(missing_ok=True)
 
 
 def _beside_what_tells_more(
@@ -144,7 +200,8 @@ def _beside_what_tells_more(
 ) -> Path:
     """Where to keep a probe: beside an earlier one with figures that it lacks, else in its place.
 
-    Earlier ones that have no more figures than the new one are removed, as if replaced.
+    Earlier ones that have no more figures than the new one, and are of no more questions, are
+    removed, as if replaced.
     """
     told = _told(figures)
     # A name for each subset of the optional figures, such as PROBE-with-drop-gate. A probe with all
@@ -154,13 +211,11 @@ def _beside_what_tells_more(
         for some in itertools.combinations(_TOLD.values(), size):
             words = "-".join(some or ("accuracy",))
             by_told[path.with_name(f"{path.stem}-with-{words}.json")] = set(some)
+    name = _COUNTS["probe"]
     for other, theirs in by_told.items():
-        if theirs <= told:
+        if theirs <= told and _kept(other).get(name, 0) <= figures.get(name, 0):
             other.unlink(missing_ok=True)
-    if not path.is_file():
-        return path
-    found = files.load_json(path)
-    earlier = found if isinstance(found, dict) else {}
+    earlier = _kept(path)
     more = [word for word in _TOLD.values() if word in _told(earlier) - told]
     if not more or earlier.get("step", step) != step:
         return path
@@ -277,10 +332,13 @@ class PlayedResult(Result):
 def probes(run: Path) -> list[Result]:
     """The probes of a run's last checkpoint; those of `aegis run` come first.
 
-    A later probe with the same questions and results is merged into the first one.
+    A later probe with the same questions and results is merged into the first one. A probe of fewer
+    questions than another of the same set, and with no other figures, is left out.
     """
     recipe, each = recipe_of(run), list[Result]()
-    for _, found in _read(run, "probe", ProbeFigures):
+    read = [found for _, found in _read(run, "probe", ProbeFigures)]
+    sets = [(question_set(found, recipe), found.settings.get("path")) for found in read]
+    for found in _without_smaller("probe", read, sets):
         by_recipe = [i for i, first in enumerate(each) if not first.settings]
         again = [i for i in by_recipe if _is_again(found, each[i], recipe)]
         for i in again[:1]:  # it may have more figures, such as the baseline's drift
@@ -313,11 +371,17 @@ def rollouts(run: Path) -> list[PlayedResult]:
     """The rollouts of a run's last checkpoint; those of `aegis run` come first.
 
     Held-out colours come after those of training. If several played the same episodes in the same
-    way, only the newest is listed.
+    way, only the newest is listed; of several by `aegis rollout` that were played in the same way,
+    only the one of the most episodes.
     """
     recipe = recipe_of(run)
     newest = dict[tuple[Any, ...], tuple[int, PlayedResult]]()
-    for path, found in _read(run, "rollout", RolloutFigures):
+    read = _read(run, "rollout", RolloutFigures)
+    ways = [(*_stage(found), _played(found, recipe)) for _, found in read]
+    shown = _without_smaller("rollout", [found for _, found in read], ways)
+    for path, found in read:
+        if not any(found is one for one in shown):
+            continue
         played = _played(found, recipe)
         episodes = tuple(found.figures.get(name) for name in ("task", "colors", "episodes"))
         written = path.stat().st_mtime_ns
@@ -326,6 +390,11 @@ def rollouts(run: Path) -> list[PlayedResult]:
             newest[*episodes, played] = written, PlayedResult(**vars(found), played=played)
     each = [found for _, found in newest.values()]
     return sorted(each, key=lambda found: found.figures.get("colors") == "held-out")
+
+
+def _stage(found: Result) -> tuple[Any, Any]:
+    """The task and the colours of a rollout."""
+    return found.figures.get("task"), found.figures.get("colors")
 
 
 def _played(found: Result, recipe: recipes.Recipe) -> Played:
@@ -358,16 +427,46 @@ def _said(name: str, value: float | None) -> str:
 def open_loops(run: Path) -> list[Result]:
     """The open-loop evaluations of a run's last checkpoint; its validation episodes come first.
 
-    Of several with equal results, such as by `aegis run` and `aegis evaluate`, the first is listed.
+    Of several with equal results, such as by `aegis run` and `aegis evaluate`, the first is listed;
+    of several by `aegis evaluate` on the same episodes, the one at the most frames.
     """
     found = dict[str, Result]()
-    for _, one in _read(run, OPEN_LOOP, OpenLoopFigures):
+    read = [one for _, one in _read(run, OPEN_LOOP, OpenLoopFigures)]
+    # The episodes that were asked for: few frames may not reach all of them.
+    of = [
+        (one.figures["split"], one.settings.get("path"), one.settings.get("episodes"))
+        for one in read
+    ]
+    for one in _without_smaller(OPEN_LOOP, read, of):
         # The path of the data may be written in several ways, and an earlier version did not record
         # single episodes.
         vary = ("data", "episode_errors")
         told = {name: value for name, value in one.figures.items() if name not in vary}
         found.setdefault(files.canonical(told), one)
     return sorted(found.values(), key=lambda one: one.figures["split"] != VALIDATION)
+
+
+def _without_smaller(kind: str, read: Sequence[Result], of: Sequence[Any]) -> list[Result]:
+    """The results without those that another by the same command makes superfluous.
+
+    It is of more questions, frames or episodes, and has every figure that they have.
+
+    Args:
+        of: for each result, what it is of; only equal ones are compared.
+    """
+    name = _COUNTS[kind]
+
+    def is_superfluous(i: int) -> bool:
+        # `aegis run` measures what the recipe asks for; these results always stay.
+        return bool(read[i].settings) and any(
+            other.settings
+            and of[i] == of[j]
+            and other.figures.get(name, 0) > read[i].figures.get(name, 0)
+            and _told(read[i].figures) <= _told(other.figures)
+            for j, other in enumerate(read)
+        )
+
+    return [one for i, one in enumerate(read) if not is_superfluous(i)]
 
 
 def _read(

@@ -54,6 +54,7 @@ _SAID = (
     "action_names",
     "proprio_names",
     "action_std",
+    "proprio_reach",
     "fps",
     "dataset",
     "base_model",

@@ -24,6 +24,8 @@ class PolicyMeta(TypedDict, total=False):
         action_names, proprio_names: a name for each number.
         fps: frames per second of the demonstrations.
         action_std: the actions' standard deviations, if the policy's scales are not these.
+        proprio_reach: how far each position ever was in training, if one was far by its scale (see
+            `data.far_positions`).
         dataset: the id on the hub of the demonstrations, or the ids of several sets.
         base_model: the id on the hub of the original model of the backbone.
         began_as: if the run began with another run's backbone, the name of the model that that run
@@ -49,6 +51,7 @@ class PolicyMeta(TypedDict, total=False):
     proprio_names: list[str]
     fps: float
     action_std: list[float]
+    proprio_reach: list[float]
     dataset: str | list[str]
     base_model: str
     began_as: str
@@ -118,11 +121,12 @@ def check_recorded(meta: PolicyMeta, actions: int, positions: int) -> None:
             raise ValueError(f"'{key}' is {names!r}")
         if len(names) != count:
             raise ValueError(f"'{key}' has {len(names)} names for {count} numbers")
-    spread = meta.get("action_std", [0.0] * actions)
-    if not isinstance(spread, list) or len(spread) != actions:
-        raise ValueError(f"'action_std' is {spread!r} for {actions} numbers")
-    if not all(type(one) in (int, float) and 0 <= one < math.inf for one in spread):
-        raise ValueError(f"'action_std' is {spread!r}")
+    for key, count in (("action_std", actions), ("proprio_reach", positions)):
+        spread = meta.get(key, [0.0] * count)
+        if not isinstance(spread, list) or len(spread) != count:
+            raise ValueError(f"'{key}' is {spread!r} for {count} numbers")
+        if not all(type(one) in (int, float) and 0 <= one < math.inf for one in spread):
+            raise ValueError(f"'{key}' is {spread!r}")
     fps = meta.get("fps", 1.0)
     if type(fps) not in (int, float) or not 0 < fps < math.inf:
         raise ValueError(f"'fps' is {fps!r}")

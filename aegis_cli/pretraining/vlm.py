@@ -20,7 +20,7 @@ from aegis_cli.data.vqa.dataset import TRAINING_MIX, Rendered, render_training
 from aegis_cli.data.vqa.metrics import Graded, by_family, grade, score
 from aegis_cli.data.vqa.packing import Packed, mirror, mirror_cells, mirror_words, pack
 from aegis_cli.data.vqa.questions import GRID, SHAPES, Question, vocabulary
-from aegis_cli.data.vqa.scenes import IMAGE_SIZE
+from aegis_cli.data.vqa.things import IMAGE_SIZE
 from aegis_cli.data.vqa.words import wide_vocabulary
 from aegis_cli.models import backbones
 from aegis_cli.models.backbones.embedded import EmbeddedVLM, Shape

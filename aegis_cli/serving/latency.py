@@ -46,7 +46,8 @@ def run(run_path: Path, repeats: int = 50, on_event: OnEvent = ignore) -> Latenc
     Raises:
         AegisError: there is no such run.
     """
-    policy = load_policy(run_path)
+    # Nothing is said of the positions, which are no robot's.
+    policy = load_policy(run_path).begin(lambda _: None)
     taken = 1000 * np.array(seconds(policy, repeats, on_event))  # [repeats] ms
     p50, p95 = (float(ms) for ms in np.quantile(taken, (0.5, 0.95)))
     return LatencyReport(

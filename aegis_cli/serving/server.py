@@ -67,8 +67,8 @@ def run(
         seed: seed of the noise, the same for every connection.
         precision, ensemble: see `load_policy`.
         on_ready: called with the address once the server listens.
-        tell: called with a line about what is loaded, who connects, what is refused, and who
-            disconnects.
+        tell: called with a line about what is loaded, who connects, what is refused, positions far
+            from those of the training, and who disconnects.
 
     Raises:
         AegisError: there is no such run, the address cannot be bound, or the policy cannot read the
@@ -157,6 +157,10 @@ class _Visit:
             self._refused = str(error)
             self._tell(f"{self._name} was refused: {'; '.join(self._refused.splitlines())}")
 
+    def sent(self, what: str) -> None:
+        """Report what was unusual about an observation that is answered nevertheless."""
+        self._tell(f"{self._name} sent {what}")
+
     def ended(self) -> None:
         """Report how many chunks the client was sent, and the mean time of each."""
         each = f", {1000 * self._seconds / self._chunks:.0f} ms each" if self._chunks else ""
@@ -180,7 +184,7 @@ class _Answering:
         try:
             with contextlib.suppress(ConnectionClosed):
                 await connection.send(wire.encode(self.reader.greeting()))
-                await self._converse(connection, self._policy.begin(), visit)
+                await self._converse(connection, self._policy.begin(visit.sent), visit)
         finally:
             visit.ended()
 

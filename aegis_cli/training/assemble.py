@@ -162,6 +162,8 @@ class TrainingRun:
         scale, normalization = self.policy.action_scale, found["normalization"]
         if "relative" in found or not is_spread(scale, normalization, self.demos):
             found["action_std"] = self.demos.action_std
+        reach = self.demos.proprio_reach(self.policy.proprio_scale, normalization)
+        found |= {} if reach is None else {"proprio_reach": reach}
         if self.demos.datasets:
             one, *others = self.demos.datasets
             found["dataset"] = [one, *others] if others else one

@@ -311,6 +311,7 @@ def test_probe_rollout_pretrain_run_arguments(aegis, stage, recipe, tmp_path, mo
                 "ask": "{}",
                 "seed": 3,
                 "keep": True,
+                "only_if_own": False,
             },
         )
     ]

@@ -18,7 +18,7 @@ from aegis_cli.common.events import ignore
 from aegis_cli.data import streams
 from aegis_cli.data.streams import corpus, embedded, masks, names, photo
 from aegis_cli.data.streams.contract import StreamTask
-from aegis_cli.data.vqa import scenes
+from aegis_cli.data.vqa import things
 from aegis_cli.models import backbones
 
 COUNTS = {"train": 20, "validation": 12, "test": 16}
@@ -190,7 +190,7 @@ def test_pair_b_is_the_same_pictures_under_names_that_none_had(load: Tasks) -> N
 def test_names_are_those_of_the_scenes_they_are_rendered_from() -> None:
     assert (
         names.COLORS == palette.COLORS
-        and names.SOLIDS == scenes.SHAPES
+        and names.SOLIDS == things.SHAPES
         and set(names.SHAPES) == set(masks.OUTLINES)
     )
 

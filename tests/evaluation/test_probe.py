@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 import torch
 from rich.console import Console
+from samples.command import refused
 from samples.small_run import recipe, teach
 from samples.tiny import make_tiny
 from samples.vqa_files import write_jsonl
@@ -348,16 +349,54 @@ def test_a_run_is_compared_with_the_model_it_began_from(
     run = tmp_path / "run"
     shutil.copytree(naive_run, run, symlinks=True)  # since measurements are kept in it
     asked = ("--questions", 30, "--json")
-    ways = [("--max-drop", 100), ("--anchor", anchor_file), ("--baseline", recipe.backbone)]
+    named = ("--baseline", recipe.backbone)
+    ways = [("--max-drop", 100), ("--anchor", anchor_file), named, ()]
     found = []
     for way in ways:
         code, out, err = aegis("probe", run / "checkpoints/last", *way, *asked)
-        assert code == 0 and (f"the baseline is '{recipe.backbone}'" in err) == (way is not ways[2])
+        assert code == 0 and (f"the baseline is '{recipe.backbone}'" in err) == (way is not named)
         found.append(json.loads(out))
     for report in found:
         assert report["baseline_accuracy"] == found[2]["baseline_accuracy"] is not None
     assert found[1]["layers"][0]["baseline_w2"] is not None
-    assert json.loads(aegis("probe", run, *asked)[1])["baseline_accuracy"] is None
+    code, out, err = aegis("probe", run, "--baseline", "none", *asked)
+    alone = json.loads(out)
+    assert code == 0 and alone["baseline_accuracy"] is None and "baseline" not in err
+    assert alone["accuracy"] == found[0]["accuracy"] and alone["asked"]["baseline"] is None
+
+
+def test_a_run_whose_model_is_gone_or_another_now_is_measured_alone(
+    aegis, taught: Path, broken: Path, demos_file: Path, tmp_path: Path
+) -> None:
+    vlm, run = tmp_path / "vlm", tmp_path / "run"
+    shutil.copytree(taught, vlm)
+    train.run(recipe(vlm), "naive", demos_file, None, run)
+    given = ("probe", run, "--questions", 30, "--json")
+    assert json.loads(aegis(*given)[1])["drop_points"] is not None
+    shutil.rmtree(vlm)
+    shutil.copytree(broken, vlm)
+    code, out, err = aegis(*given)
+    assert code == 0 and json.loads(out)["drop_points"] is None
+    assert f"'{vlm}' is not the model any more that '{run}' began from" in err
+    code, out, _ = aegis(*given, "--max-drop", 100)  # a gate needs a drop
+    assert code == 0 and json.loads(out)["drop_points"] is not None
+    shutil.rmtree(vlm)
+    code, out, err = aegis(*given)
+    assert code == 0 and json.loads(out)["drop_points"] is None
+    assert f"only the accuracy is measured, and no drop: '{vlm}'" in err
+    assert aegis(*given, "--max-drop", 100)[0] == 2
+
+
+def test_without_a_baseline_the_gate_of_the_recipe_is_left_out(
+    aegis, taught: Path, demos_file: Path, tmp_path: Path
+) -> None:
+    settings, run = recipe(taught), tmp_path / "run"
+    settings = replace(settings, probe=replace(settings.probe, max_drop=0.0))
+    train.run(settings, "naive", demos_file, None, run)
+    given = ("probe", run, "--questions", 30, "--baseline", "none", "--json")
+    code, out, _ = aegis(*given)
+    assert code == 0 and json.loads(out)["passed"] is None
+    assert "--max-drop without --baseline" in refused(aegis(*given, "--max-drop", 1))
 
 
 def test_json_and_exit_codes(aegis, taught: Path, broken: Path, own_anchor: Path) -> None:

@@ -7,6 +7,7 @@ import os
 import threading
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from samples.reports import open_loop, probe, rollout, write_job
@@ -217,6 +218,71 @@ def test_errors_on_held_out_episodes_come_first_and_only_those_of_the_last_check
 )
 def test_it_is_said_which_episodes_an_error_is_of(changes: dict[str, object], said: str) -> None:
     assert results.evaluated_on({**open_loop(1, 2), **changes}) == said
+
+
+def kept_with(run: Path, name: str, found: dict[str, Any], **settings: Any) -> list[str]:
+    """The texts of the warnings while a measurement is kept."""
+    told: list[Event] = []
+    results.keep_if_possible(run, name, found, settings, told.append)
+    return [event.text for event in told if isinstance(event, Warned)]
+
+
+def test_an_evaluation_of_fewer_frames_does_not_replace_one_of_more(run: Path) -> None:
+    name, asked = "evaluate-validation-arm", {"path": "/home/arm", "episodes": None, "seed": 0}
+    many, few = open_loop(1, 3, error=1.25, frames=120), open_loop(1, error=1.5, frames=8)
+    assert kept_with(run, name, many, **asked, frames=1000) == []
+    (told,) = kept_with(run, name, few, **asked, frames=8)
+    assert told.endswith("which is of 120 frames and not of 8")
+    assert [found.figures for found in results.open_loops(run)] == [many]
+    beside = run / "results" / f"{name}-of-8-frames.json"
+    assert files.load_json(beside)["relative_error"] == 1.5
+    newer = {**many, "relative_error": 1.75}
+    assert kept_with(run, name, newer, **asked, frames=1000) == []
+    assert [found.figures for found in results.open_loops(run)] == [newer]
+    assert not beside.exists()
+
+
+def test_few_frames_of_other_episodes_are_shown_too(run: Path) -> None:
+    for episodes, frames in (([1, 3], 120), ([5], 8)):
+        found = open_loop(*episodes, split="chosen", frames=frames)
+        kept_with(run, "evaluate-chosen-arm", found, path="/home/arm", episodes=episodes)
+    assert [found.figures["frames"] for found in results.open_loops(run)] == [120, 8]
+
+
+def test_a_quick_look_replaces_more_frames_of_an_earlier_checkpoint(run: Path) -> None:
+    name, asked = "evaluate-validation-arm", {"path": "/home/arm"}
+    kept_with(run, name, open_loop(1, frames=120), **asked)
+    link = run / "checkpoints" / "last"
+    link.unlink()
+    link.symlink_to(checkpoint_at(run, 9).name)
+    assert kept_with(run, name, open_loop(1, frames=8), **asked) == []
+    assert [found.figures["frames"] for found in results.open_loops(run)] == [8]
+
+
+def test_a_rollout_of_fewer_episodes_does_not_replace_one_of_more(run: Path) -> None:
+    asked = {"task": "reach", "colors": "seen", "seed": 7, "replan": 4}
+    for episodes in (300, 3):
+        found = rollout("seen", 0.25) | {"episodes": episodes}
+        kept_with(run, "rollout-seen", found, **asked, episodes=episodes)
+    shown = [found.figures["episodes"] for found in results.rollouts(run)]
+    assert shown == [4, 300, 4]  # two of them are by `aegis run`
+    found = rollout("seen", 0.25) | {"episodes": 3}  # which was played in another way
+    kept_with(run, "rollout-seen", found, **asked, episodes=3, delay=2, guided=False)
+    assert [found.figures["episodes"] for found in results.rollouts(run)] == [4, 300, 3, 4]
+
+
+def test_a_probe_of_fewer_questions_does_not_replace_one_of_more(run: Path) -> None:
+    for questions in (76, 12):
+        found = probe_of(2.0) | {"questions": questions}
+        told = kept_with(run, "probe-scenes", found, vqa="scenes", questions=questions)
+    assert told and told[0].endswith("which is of 76 questions and not of 12")
+    assert [found.figures["questions"] for found in results.probes(run)] == [40, 76]
+    # It tells a verdict that the larger one lacks.
+    for passed in (True, None):
+        gated = probe_of(2.0, passed=passed) | {"questions": 12}
+        kept_with(run, "probe-scenes", gated, vqa="scenes", questions=12)
+    shown = [(found.figures["questions"], found.figures["passed"]) for found in results.probes(run)]
+    assert shown == [(40, None), (76, None), (12, True)]
 
 
 def test_paths_that_are_not_utf8_are_kept_and_read_back(run: Path) -> None:

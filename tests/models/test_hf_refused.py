@@ -84,6 +84,22 @@ def test_weights_that_a_repository_has_twice_are_fetched_once(
     assert {p.name for p in model_folder.fetch("org/name").iterdir()} == set(there[:2])
 
 
+@pytest.mark.parametrize("cached", [True, False])
+def test_whether_a_model_of_the_hub_is_here_is_found_without_a_download(
+    cached: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def download(_: str, local_files_only: bool, **__: object) -> str:
+        assert local_files_only
+        if not cached:
+            raise FileNotFoundError("not in the cache")
+        return str(tmp_path)
+
+    monkeypatch.setattr("huggingface_hub.snapshot_download", download)
+    assert backbones.is_here("org/name") == backbones.is_here("org/name#layers") == cached
+    assert backbones.is_here("embedded") and backbones.is_here("random:smolvlm2-256m")
+    assert not backbones.is_here("runs/none")
+
+
 @pytest.mark.parametrize(
     "name", ["runs/none", "./x", "../x", "/no/x", "~/x", "none", "a/b/c", "models/x"]
 )

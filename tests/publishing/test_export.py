@@ -124,7 +124,9 @@ def test_probe_rollout_and_inspect_take_the_folder(
     found = []
     for folder in (run_folder, exported):
         said = json.loads(aegis("rollout", folder, "--episodes", "2", "--json")[1])
-        asked = json.loads(aegis("probe", folder, "--questions", "14", "--json")[1])
+        # By default only a run is compared with the model that it began from.
+        given = ("probe", folder, "--questions", "14", "--baseline", "none", "--json")
+        asked = json.loads(aegis(*given)[1])
         del said["episodes_per_s"], asked["asked"]["target"]
         found.append((said, asked))
     assert found[0] == found[1]

@@ -441,6 +441,35 @@ def test_a_blank_task_is_warned_of_once(plugin: Any, caplog: pytest.LogCaptureFi
     assert not caplog.records
 
 
+def test_a_motor_in_other_units_is_warned_of_once(
+    plugin: Any, caplog: pytest.LogCaptureFixture
+) -> None:
+    model = make_policy().eval()
+    policy = plugin.AegisPolicy(config(plugin, model, IMAGE), model=model, meta=NAMED)
+    policy.select_action(seen())
+    assert not caplog.records
+    for _ in range(3):
+        policy.select_action(seen(state=torch.tensor([[0.0, -2000.0, 0.0]])))
+        policy.reset()
+    (record,) = caplog.records
+    assert record.message.startswith("The policy was given positions far from those of the train")
+    assert "'y' is -2000 (training mean -0.2, standard deviation 0.5)" in record.message
+
+
+@pytest.mark.parametrize("closes", [True, False])
+def test_a_new_policy_knows_how_far_its_motors_ever_were(
+    closes: bool, plugin: Any, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(plugin, "_new", lambda *_: make_policy())
+    ends = {"min": [-1.0, -2.0, -1.0], "max": [1.0, 30.0 if closes else 2.0, 1.0]}
+    statistics = {"observation.state": ends}
+    policy = plugin.AegisPolicy(config(plugin, make_policy(), IMAGE), dataset_stats=statistics)
+    policy.select_action(seen(state=torch.tensor([[0.0, 30.0, 0.0]])))
+    told = [record.levelname for record in caplog.records]
+    assert told == ([] if closes else ["WARNING"])
+    assert ("proprio_reach" in policy._meta) == closes
+
+
 def test_where_lerobot_compiles_a_policy_acts_as_without_and_says_so(
     plugin: Any, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -10,7 +10,8 @@ import pytest
 from aegis_cli.common.palette import COLORS
 from aegis_cli.data.vqa.dataset import TRAINING_MIX
 from aegis_cli.data.vqa.questions import GRID, Balancer, Question, vocabulary
-from aegis_cli.data.vqa.scenes import IMAGE_SIZE, SHAPES, Scene, SceneRenderer, Thing, scene_rng
+from aegis_cli.data.vqa.scenes import SceneRenderer, scene_rng
+from aegis_cli.data.vqa.things import IMAGE_SIZE, SHAPES, Scene, Thing
 from aegis_cli.models.backbones.tokenizer import SPECIAL
 
 SCENES = 300

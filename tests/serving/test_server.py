@@ -202,6 +202,21 @@ def test_the_server_tells_who_comes_what_is_refused_and_who_goes() -> None:
     assert re.fullmatch(r"has gone after 1 chunk, \d+ ms each", said[3])
 
 
+def test_positions_in_other_units_are_answered_and_told_of_once_per_connection() -> None:
+    told: list[str] = []
+    far = observation(**{"observation/state": [-2000.0, 0.0, 0.0]})
+    with served(deployed(), tell=told.append) as serving:
+        for _ in range(2):
+            with Client(serving.url) as client:
+                answers = [client.infer(far) for _ in range(3)]
+            assert all(answer["actions"].shape == (4, 2) for answer in answers)
+    said = [line.partition(" ")[2] for line in told]
+    sent = [line for line in said if line.startswith("sent positions far from those of the train")]
+    assert len(sent) == 2 and len(said) == 6 and said[1] == said[4] == sent[0]
+    assert "positions[0] is -2000 (training mean 0.1, standard deviation 1.5)" in sent[0]
+    assert "\n" not in sent[0]
+
+
 @pytest.fixture(scope="module")
 def listening() -> Any:
     with served(deployed()) as serving:

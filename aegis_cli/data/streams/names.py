@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-# Colours are those of palette.py and solids those of vqa/scenes.py, in the same order: a picture's
+# Colours are those of palette.py and solids those of vqa/things.py, in the same order: a picture's
 # label is an index into either.
 COLORS = ("red", "green", "blue", "yellow", "orange", "purple", "cyan", "pink")
 SOLIDS = ("cube", "ball", "cylinder")

@@ -12,7 +12,8 @@ import numpy as np
 from aegis_cli.common.palette import COLORS
 from aegis_cli.data.streams.names import SIZE
 from aegis_cli.data.streams.photo import Photo, to_bytes
-from aegis_cli.data.vqa.scenes import IMAGE_SIZE, SHAPES, renderer_of_thread
+from aegis_cli.data.vqa.scenes import renderer_of_thread
+from aegis_cli.data.vqa.things import IMAGE_SIZE, SHAPES
 from aegis_cli.sim import point, reach
 from aegis_cli.sim.scene import Look, lay_out
 

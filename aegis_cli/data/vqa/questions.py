@@ -10,7 +10,7 @@ import numpy as np
 
 from aegis_cli.common.palette import COLORS
 from aegis_cli.data.vqa.answers import normalise
-from aegis_cli.data.vqa.scenes import IMAGE_SIZE, SHAPES, Scene, Thing
+from aegis_cli.data.vqa.things import IMAGE_SIZE, SHAPES, Scene, Thing
 
 FAMILIES: tuple[str, ...] = ("color", "shape", "count", "count-kind", "exists", "side", "where")
 GRID = 8  # location words: x0..x7 from left to right, y0..y7 from top to bottom

@@ -24,8 +24,8 @@ gl.choose_backend()
 import dm_control.mujoco  # noqa: E402, F401
 import mujoco  # noqa: E402  (the OpenGL backend has to be chosen before the first import)
 
-IMAGE_SIZE = 64
-SHAPES: tuple[str, ...] = ("cube", "ball", "cylinder")
+from aegis_cli.data.vqa.things import IMAGE_SIZE, SHAPES, Scene, Thing  # noqa: E402
+
 MAX_OBJECTS = 4
 MAX_CLUTTER = 2
 FIELD_OF_VIEW_DEG = 45.0
@@ -42,24 +42,6 @@ _GEOM_TYPE = {
 _FOCAL_PX = IMAGE_SIZE / 2 / math.tan(math.radians(FIELD_OF_VIEW_DEG) / 2)
 _MARGIN_PX = 5.0
 _SEPARATION = 1.25  # centres are at least this many summed radii apart in the image
-
-
-@dataclass(frozen=True)
-class Thing:
-    """One object: its colour, its shape, and its centre in the image (pixels, origin top left)."""
-
-    color: str
-    shape: str
-    x_px: float
-    y_px: float
-
-
-@dataclass(frozen=True)
-class Scene:
-    """A picture [64, 64, 3] uint8 and the things in it."""
-
-    image: np.ndarray
-    things: tuple[Thing, ...]
 
 
 def scene_rng(seed: int, split: str, index: int) -> np.random.Generator:

@@ -46,6 +46,14 @@ def locate(name: str) -> Path:
     raise _no_backbone(name)
 
 
+def is_here(name: str) -> bool:
+    """Whether a model can be loaded without downloading it; `name` is as for `load`."""
+    own = divided(name)[0]
+    if shapes.of_backbone(name) is not None or _on_disk(own) is not None:
+        return True
+    return not hub.is_local(own) and _has_transformers() and model_folder.is_cached(own)
+
+
 def divided(name: str) -> tuple[str, str | None]:
     """A backbone's name without the part after '#', and that part, which names its layers, or None.
 

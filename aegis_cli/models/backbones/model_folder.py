@@ -41,10 +41,8 @@ def fetch(name: str) -> Path:
     Raises:
         AegisError: neither in the cache nor downloadable.
     """
-    wanted = [f"*{suffix}" for suffix in (*_PROCESSOR_SUFFIXES, ".safetensors")]
     try:
-        # Mistral's repositories contain their weights twice.
-        return hub.snapshot(name, "model", wanted, unwanted=["consolidated*"])
+        return _snapshot(name)
     except (OSError, ValueError) as error:
         raise AegisError(
             f"no folder '{name}', and no model of that name from the Hugging Face hub: "
@@ -53,6 +51,21 @@ def fetch(name: str) -> Path:
             f"on a machine with a network: hf download {name} --local-dir MODEL; then give MODEL: "
             f"{GIVE}",
         ) from error
+
+
+def is_cached(name: str) -> bool:
+    """Whether a model on the hub has been downloaded."""
+    try:
+        _snapshot(name, cached=True)
+    except (OSError, ValueError):
+        return False
+    return True
+
+
+def _snapshot(name: str, cached: bool = False) -> Path:
+    wanted = [f"*{suffix}" for suffix in (*_PROCESSOR_SUFFIXES, ".safetensors")]
+    # Mistral's repositories contain their weights twice.
+    return hub.snapshot(name, "model", wanted, unwanted=["consolidated*"], cached=cached)
 
 
 def is_model(folder: Path) -> bool:

@@ -10,7 +10,7 @@ from samples.vqa_truth import SCENES, WORDS, truth
 
 from aegis_cli.data.vqa.packing import mirror, mirror_cells, mirror_words, pack
 from aegis_cli.data.vqa.questions import FAMILIES, Question, cell_labels
-from aegis_cli.data.vqa.scenes import IMAGE_SIZE, Scene
+from aegis_cli.data.vqa.things import IMAGE_SIZE, Scene
 from aegis_cli.models.backbones.tokenizer import Tokenizer
 from aegis_cli.pretraining.vlm import BLOCK_TOKENS, BLOCKS, SHARES
 

@@ -22,14 +22,8 @@ from aegis_cli.common.palette import COLORS, RGB
 from aegis_cli.data.vqa import dataset
 from aegis_cli.data.vqa.dataset import VQASet, load_scenes, render_training
 from aegis_cli.data.vqa.questions import FAMILIES, GRID, cell_labels, majority_share
-from aegis_cli.data.vqa.scenes import (
-    IMAGE_SIZE,
-    SHAPES,
-    SPLITS,
-    SceneRenderer,
-    renderer_of_thread,
-    scene_rng,
-)
+from aegis_cli.data.vqa.scenes import SPLITS, SceneRenderer, renderer_of_thread, scene_rng
+from aegis_cli.data.vqa.things import IMAGE_SIZE, SHAPES
 from aegis_cli.models.backbones.embedded import MAX_ANSWER, MAX_TEXT
 from aegis_cli.models.backbones.tokenizer import Tokenizer
 from aegis_cli.pretraining.vlm import BLOCK_TOKENS

@@ -21,8 +21,9 @@ from aegis_cli.common.errors import AegisError
 from aegis_cli.common.pictures import fit
 from aegis_cli.core.continuation import Continued
 from aegis_cli.core.ensemble import TemporalEnsemble
-from aegis_cli.data import joints
+from aegis_cli.data import far_positions, joints
 from aegis_cli.data.batch import Images, Normalizer, RobotBatch, least_spread
+from aegis_cli.data.far_positions import FarPositions
 from aegis_cli.data.lerobot import layout
 from aegis_cli.models import backbones, lerobot_folder
 from aegis_cli.models.expert import ActionExpert, ExpertShape
@@ -76,6 +77,9 @@ class AegisPolicy(PreTrainedPolicy):
         self._meta = dict(meta or known)
         if model is None and (spread := _spread(dataset_stats, ACTION)) is not None:
             self._meta["action_std"] = spread.tolist()
+        if model is None and (ends := _ends(dataset_stats, OBS_STATE)) is not None:
+            reach = far_positions.reach(ends, self.model.proprio_scale, config.normalization)
+            self._meta |= {} if reach is None else {"proprio_reach": reach}
         self._cameras = self._in_order()
         if model is None and self.model.backbone.image_size is None:
             features = config.image_features
@@ -89,6 +93,12 @@ class AegisPolicy(PreTrainedPolicy):
         # LeRobot's programs for robots use these names for a policy's actions, if they need any.
         config.action_feature_names = self._meta.get("action_names")
         self._is_told_of_compiling = False
+        self._far = FarPositions(
+            self.model.proprio_scale,
+            self._meta.get("proprio_names"),
+            self._meta.get("normalization", "mean_std"),
+            self._meta.get("proprio_reach"),
+        )
         self._generator = torch.Generator()
         self.reset()
 
@@ -380,7 +390,7 @@ class AegisPolicy(PreTrainedPolicy):
         return keys
 
     def _state(self, batch: Mapping[str, Any], rows: int) -> Tensor:
-        """The positions [B, P] of `rows` robots.
+        """The positions [B, P] of `rows` robots; warns once of each that is far from training.
 
         Raises:
             AegisError: they are missing, have another shape, or are not finite.
@@ -400,7 +410,10 @@ class AegisPolicy(PreTrainedPolicy):
                 "finite numbers",
                 "check the robot's sensors",
             )
-        return found.float()
+        state = found.float()
+        if (far := self._far.notice(state.cpu().numpy())) is not None:
+            _LOG.warning("The policy was given %s", far)
+        return state
 
     def _images(self, batch: Mapping[str, Any]) -> Images:
         missing = [name for name in self._cameras if name not in batch]
@@ -572,6 +585,14 @@ def _never_varies(of: Mapping[str, Any]) -> Tensor | None:
         return None
     low, high, mean = (_numbers(of[name]) for name in ("min", "max", "mean"))
     return high - low <= least_spread(mean)
+
+
+def _ends(statistics: Statistics | None, name: str) -> Tensor | None:
+    """The minima and maxima [2, D] of a feature; None if unknown."""
+    of = (statistics or {}).get(name, {})
+    if any(of.get(end) is None for end in ("min", "max")):
+        return None
+    return torch.stack([_numbers(of[end]) for end in ("min", "max")]).float()
 
 
 def _spread(statistics: Statistics | None, name: str) -> Tensor | None:
