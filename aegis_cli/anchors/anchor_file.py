@@ -10,9 +10,8 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import torch
@@ -126,7 +125,7 @@ class Wanted:
     name: str
     option: str
     measuring: str | None = None
-    prepares: Mapping[str, str] = MappingProxyType({})
+    prepares: Mapping[str, str] = field(default_factory=dict)
 
 
 def load(path: Path, wanted: Wanted) -> Anchor:
