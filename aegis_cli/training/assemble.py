@@ -255,8 +255,10 @@ class TrainingRun:
             wide=self.recipe.train.weights == BF16_MASTER,
             averaged=averaged,
         )
-        if self.temporary is not None and not (going_on and self.temporary == saved):
-            if self.temporary != saved:
+        # `temporary` is a resolved path; `out` may be relative, or lead through a link.
+        is_same = self.temporary == saved.resolve()
+        if self.temporary is not None and not (going_on and is_same):
+            if not is_same:
                 shutil.rmtree(self.temporary, ignore_errors=True)
             self.temporary = None
         kept = self.recipe.train.keep_checkpoints

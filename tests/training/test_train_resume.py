@@ -598,6 +598,40 @@ def test_a_divergence_right_after_a_checkpoint_leaves_it_alone(
     ]
 
 
+@pytest.mark.parametrize("times", [1, 2])
+@pytest.mark.parametrize("at", [3, STEPS])
+@pytest.mark.parametrize("relative", [True, False])
+def test_a_run_interrupted_while_it_validates_keeps_the_checkpoint_of_that_step(
+    relative: bool,
+    at: int,
+    times: int,
+    recipe: Recipe,
+    start: Start,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Interrupted once or twice in the same validation, after a step that has a checkpoint."""
+    monkeypatch.chdir(tmp_path)
+    every = replace(recipe, train=replace(recipe.train, checkpoint_every=3))
+    out = Path("run") if relative else tmp_path / "run"
+    start("naive", tmp_path / "whole", recipe=every)
+    measure = train.validation_loss
+
+    def interrupt(*given: Any) -> float:
+        if len(list((out / "checkpoints").glob("0*"))) * 3 < at - 3:
+            return measure(*given)
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(train, "validation_loss", interrupt)
+        for _ in range(times):
+            with pytest.raises(KeyboardInterrupt):
+                start("naive", out, recipe=every, resume=True)
+            assert checkpoint.last(out).resolve().name == f"{at:06d}"
+    start("naive", out, recipe=every, resume=True)
+    assert_same_run(out, tmp_path / "whole")
+
+
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
 def test_a_validation_loss_that_is_not_finite_ends_the_run(
     start: Start, naive_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bad: float
