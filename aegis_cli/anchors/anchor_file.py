@@ -139,8 +139,8 @@ def load(path: Path, wanted: Wanted) -> Anchor:
     other = preparation.differing(wanted.prepares, artifact.header.meta.get(preparation.META, {}))
     if other is not None:
         raise AegisError(
-            f"a backbone that makes its inputs of images and texts otherwise than when the anchor "
-            f"'{path}' was measured: {other}",
+            f"a backbone that makes its inputs of images and texts differently from when the "
+            f"anchor '{path}' was measured: {other}",
             "the same settings of the processor, since the anchor describes what the weights do "
             "with these inputs",
             "measure the anchor again with aegis anchor, or bring the settings back in the "

@@ -842,7 +842,9 @@ def _drop_against(
         baseline = None
     if max_drop is not None and baseline is None:
         expected = "something to measure the drop against"
-        raise AegisError("--max-drop without --baseline", expected, "add --baseline embedded")
+        raise AegisError(
+            "--max-drop without a baseline", expected, "name one, e.g. --baseline embedded"
+        )
     return baseline
 
 
@@ -927,8 +929,8 @@ def compare(
         str | None,
         Option(
             metavar="RUN",
-            help="Run that paired differences are from: its folder, or its method; default: the "
-            "first run, or the naive one of a first folder of several.",
+            help="Run that the others are compared with in pairs: its folder or its method; "
+            "default: the first run or, if a folder of several comes first, its naive one.",
         ),
     ] = None,
     wide: Wide = False,

@@ -265,8 +265,8 @@ VlmPrefix = Annotated[
     str | None,
     Option(
         metavar="NAME",
-        help="Of a policy with several VLMs, such as one beside its average (EMA): the beginning "
-        "of the names of the one to take.",
+        help="Which of a policy's several VLMs is meant, as beside an average of the weights "
+        "(EMA): the beginning of its tensors' names.",
     ),
 ]
 Json = Annotated[bool, Option("--json", help="Print the report as JSON on stdout.")]

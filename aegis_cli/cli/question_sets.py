@@ -89,7 +89,10 @@ def _lacking(run: Path, began_from: str) -> str | None:
         return error.found
     if backbones.is_here(began_from):
         return None
-    return f"'{began_from}', the model that the run began from, is not here (--baseline names it)"
+    return (
+        f"'{began_from}', the model that the run began from, is not on this machine (--baseline "
+        "says where)"
+    )
 
 
 def _of_run(model: str, asks: bool) -> tuple[Probe, ...]:

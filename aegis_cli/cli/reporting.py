@@ -26,7 +26,7 @@ def write(paths: Sequence[Path], out: Path | None, as_json: bool) -> None:
         files.check_writable(out)  # before anything is read
     elif len(paths) > 1:
         fix = commands.aegis("report", *paths, "--out", "compared.html")
-        found = f"{len(paths)} folders without --out, so that their page belongs into none of them"
+        found = f"{len(paths)} folders without --out, whose page belongs in none of them"
         raise AegisError(found, "the file to write", fix)
     # Imported here, because the pages need torch through the artifacts.
     from aegis_cli.cli import page

@@ -82,8 +82,9 @@ class FarPositions:
         values = positions.reshape(rows.shape)
         said = [self._said(i, float(values[rows[:, i].argmax(), i])) for i in new]
         return (
-            f"positions far from those of the training: {', '.join(said)}. See that the units "
-            "(degrees, radians, normalised to -100..100) and the calibration are the training's"
+            f"positions far from those of the training: {', '.join(said)}. Check that the units "
+            "(degrees, radians, normalised to -100..100) and the calibration are those of the "
+            "training"
         )
 
     def _said(self, i: int, value: float) -> str:

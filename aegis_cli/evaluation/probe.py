@@ -291,7 +291,7 @@ def check_preparation(
     if other is None:
         return
     found = (
-        f"'{target}' prepares images or text otherwise than its baseline '{baseline}' does: {other}"
+        f"'{target}' prepares images or text differently from its baseline '{baseline}': {other}"
     )
     fix = (
         "give both the same files of the processor (e.g. preprocessor_config.json; a run has its "
@@ -329,7 +329,7 @@ def _warn_of_another_start(
     )
     if is_left_out:
         text = (
-            f"only the accuracy is measured, and no drop: '{baseline}' is not the model any more "
+            f"only the accuracy is measured, and no drop: '{baseline}' is no longer the model "
             f"that '{target}' began from"
         )
     on_event(Warned("probe", text))

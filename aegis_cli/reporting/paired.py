@@ -1,8 +1,8 @@
 """Paired differences between runs: of the same questions, episodes or recorded frames.
 
 What is hard for one run is hard for another, which cancels in a difference of pairs. So its
-interval is narrower than those of the two figures suggest. It is an interval over questions or
-episodes, of one training each: it does not tell how far another seed would be away.
+interval is usually narrower than those of the two figures suggest. It is an interval over questions
+or episodes, of one training each: it does not tell how far another seed would be away.
 """
 
 from __future__ import annotations

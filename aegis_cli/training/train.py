@@ -274,8 +274,8 @@ def _tell_of_adjustments(run: TrainingRun, on_event: OnEvent) -> None:
     if changes:
         text = (
             f"'{run.out}' goes on with {changes}. This changes memory, time or what is written, "
-            "and what is learned at most by rounding; files may differ from those of an "
-            "uninterrupted run"
+            "and what is learned at most by rounding, or by where a method's steps end "
+            "(nullspace.every, kfac.every); files may differ from those of an uninterrupted run"
         )
         on_event(Warned("train", text))
 
@@ -420,7 +420,7 @@ def _check_preparation(run: TrainingRun, meta: Mapping[str, Any]) -> None:
     other = preparation.differing(now, then)
     if other is not None:
         raise AegisError(
-            f"'{run.recipe.backbone}' prepares images or text otherwise than when the run in "
+            f"'{run.recipe.backbone}' prepares images or text differently from when the run in "
             f"'{run.out}' began: {other}",
             "the same settings of the processor",
             "bring them back in the model's folder (e.g. in its preprocessor_config.json), or "
@@ -1071,8 +1071,8 @@ def _tell_of_no_checkpoint_within(run: TrainingRun, on_event: OnEvent) -> None:
     probe = run.recipe.probe
     by = " by the upper end of its interval (probe.gate)" if probe.gate == UPPER else ""
     text = (
-        f"no checkpoint is known to have lost at most {probe.max_drop:g} points of VQA{by}, which "
-        f"probe.max_drop allows: the one kept as the best, of step {best.step}, has the lowest "
+        f"no checkpoint is known to have lost at most {probe.max_drop:g} points of VQA "
+        f"(probe.max_drop){by}: the one kept as the best, of step {best.step}, has the lowest "
         "validation loss"
     )
     on_event(Warned("train", text))

@@ -150,7 +150,7 @@ def of_past_limit(recipe: Recipe, step: int, past: Mapping[str, ToldOfSet]) -> s
         )
     return (
         f"after step {step} there are too few answers to tell whether more than {limit} points of "
-        f"VQA are lost (probe.max_drop): it is {drop:.2f} {where}, with a 95 % interval of "
+        f"VQA are lost (probe.max_drop): the drop is {drop:.2f} {where}, with a 95 % interval of "
         f"{low:.2f} to {high:.2f}, whose upper end counts (probe.gate: {recipe.probe.gate}); raise "
         "probe.while_training"
     )

@@ -377,7 +377,7 @@ def test_a_run_whose_model_is_gone_or_another_now_is_measured_alone(
     shutil.copytree(broken, vlm)
     code, out, err = aegis(*given)
     assert code == 0 and json.loads(out)["drop_points"] is None
-    assert f"'{vlm}' is not the model any more that '{run}' began from" in err
+    assert f"'{vlm}' is no longer the model that '{run}' began from" in err
     code, out, _ = aegis(*given, "--max-drop", 100)  # a gate needs a drop
     assert code == 0 and json.loads(out)["drop_points"] is not None
     shutil.rmtree(vlm)
@@ -396,7 +396,7 @@ def test_without_a_baseline_the_gate_of_the_recipe_is_left_out(
     given = ("probe", run, "--questions", 30, "--baseline", "none", "--json")
     code, out, _ = aegis(*given)
     assert code == 0 and json.loads(out)["passed"] is None
-    assert "--max-drop without --baseline" in refused(aegis(*given, "--max-drop", 1))
+    assert "--max-drop without a baseline" in refused(aegis(*given, "--max-drop", 1))
 
 
 def test_json_and_exit_codes(aegis, taught: Path, broken: Path, own_anchor: Path) -> None:
