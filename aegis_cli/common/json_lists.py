@@ -36,8 +36,8 @@ def items(file: BinaryIO, key: str | None, rest: dict[str, Any], on_read: Read) 
     if json.detect_encoding(file.read(4)) not in ("utf-8", "utf-8-sig"):
         raise Unusual("another encoding")
     file.seek(0)
-    text = _Text(file, on_read)
     try:
+        text = _Text(file, on_read)
         if key is None:
             yield from text.listed()
         else:

@@ -19,6 +19,14 @@ _RESTART = Path("/proc/self/clear_refs")  # writing 5 to it resets the peak
 # Parameters of glibc's `mallopt`: the size from which a block gets its own mapping, which is
 # unmapped when it is freed; and how much may be free at the end of the heap before it is returned.
 _MAPPED_FROM, _FREE_AT_END = -3, -1
+_CGROUPS = Path("/sys/fs/cgroup")
+# For each version of cgroups: the files of the limit and of what is used, and the name in
+# memory.stat of the cache that can be dropped.
+_LIMITS = (
+    ("memory.max", "memory.current", "inactive_file"),
+    ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes", "total_inactive_file"),
+)
+_NO_LIMIT = 2**60  # version 1 has no word for none, but a number near 2^63
 _MAPPED, _USUAL = 2**20, 2**25  # bytes
 
 
@@ -31,7 +39,26 @@ def free(device: torch.device) -> int | None:
     except FileNotFoundError:  # not Linux
         return None
     found = re.search(r"^MemAvailable:\s+(\d+) kB", listed, re.MULTILINE)
-    return None if found is None else int(found[1]) * 1024
+    machine = None if found is None else int(found[1]) * 1024
+    known = [room for room in (machine, _within_limit()) if room is not None]
+    return min(known, default=None)
+
+
+def _within_limit() -> int | None:
+    """Bytes below the limit of this container (cgroup v2 or v1); None without a limit."""
+    for limit, used, reclaimable in _LIMITS:
+        try:
+            most = (_CGROUPS / limit).read_text(encoding="ascii").strip()
+            now = int((_CGROUPS / used).read_text(encoding="ascii"))
+            listed = (_CGROUPS / limit).with_name("memory.stat").read_text(encoding="ascii")
+        except (OSError, ValueError):  # no such version, or nothing that may be read
+            continue
+        if most == "max" or int(most) >= _NO_LIMIT:
+            return None
+        # The limit counts the cache of files too, which the system drops when memory is short.
+        cached = re.search(rf"^{reclaimable} (\d+)$", listed, re.MULTILINE)
+        return max(0, int(most) - now + (0 if cached is None else int(cached[1])))
+    return None
 
 
 def restart_peak(device: torch.device) -> int:

@@ -181,18 +181,28 @@ def _remove_smaller(
     path: Path, kind: str, figures: Mapping[str, Any], settings: Mapping[str, Any]
 ) -> None:
     """Remove what `_place_for` kept beside a measurement that a new one makes superfluous."""
-    name = _COUNTS[kind]
-
-    def asked(of: Mapping[str, Any]) -> dict[str, Any]:
-        return {key: value for key, value in of.items() if key != name}
-
+    name, new = _COUNTS[kind], Result(path.stem, dict(figures), dict(settings))
     pattern = _SMALLER.format(count="*", name=name)
     for other in path.parent.glob(f"{glob.escape(path.stem)}{pattern}*.json"):
         found = _kept(other)
-        is_smaller = found.get(name, 0) <= figures.get(name, 0)
-        is_same = asked(found.get("settings") or {}) == asked(settings)
-        if is_smaller and is_same and _told(found) <= _told(figures):
+        small = Result(other.stem, found, found.get("settings") or {})
+        if found.get(name, 0) <= figures.get(name, 0) and _is_part(kind, small, new):
             other.unlink(missing_ok=True)
+
+
+def _is_part(kind: str, small: Result, large: Result) -> bool:
+    """Whether a measurement tells nothing that one of more questions, frames or episodes does not.
+
+    Both were asked for the same except for that number.
+    """
+    vary, told = {_COUNTS[kind]}, _told(small.figures)
+    if "drop" not in told:
+        vary.add("baseline")
+    if "gate" not in told:
+        vary |= {"max_drop", "gate"}
+    names = (small.settings.keys() | large.settings.keys()) - vary
+    same = all(small.settings.get(name) == large.settings.get(name) for name in names)
+    return same and told <= _told(large.figures)
 
 
 def _beside_what_tells_more(
@@ -337,8 +347,7 @@ def probes(run: Path) -> list[Result]:
     """
     recipe, each = recipe_of(run), list[Result]()
     read = [found for _, found in _read(run, "probe", ProbeFigures)]
-    sets = [(question_set(found, recipe), found.settings.get("path")) for found in read]
-    for found in _without_smaller("probe", read, sets):
+    for found in _without_smaller("probe", read):
         by_recipe = [i for i, first in enumerate(each) if not first.settings]
         again = [i for i in by_recipe if _is_again(found, each[i], recipe)]
         for i in again[:1]:  # it may have more figures, such as the baseline's drift
@@ -377,8 +386,7 @@ def rollouts(run: Path) -> list[PlayedResult]:
     recipe = recipe_of(run)
     newest = dict[tuple[Any, ...], tuple[int, PlayedResult]]()
     read = _read(run, "rollout", RolloutFigures)
-    ways = [(*_stage(found), _played(found, recipe)) for _, found in read]
-    shown = _without_smaller("rollout", [found for _, found in read], ways)
+    shown = _without_smaller("rollout", [found for _, found in read])
     for path, found in read:
         if not any(found is one for one in shown):
             continue
@@ -390,11 +398,6 @@ def rollouts(run: Path) -> list[PlayedResult]:
             newest[*episodes, played] = written, PlayedResult(**vars(found), played=played)
     each = [found for _, found in newest.values()]
     return sorted(each, key=lambda found: found.figures.get("colors") == "held-out")
-
-
-def _stage(found: Result) -> tuple[Any, Any]:
-    """The task and the colours of a rollout."""
-    return found.figures.get("task"), found.figures.get("colors")
 
 
 def _played(found: Result, recipe: recipes.Recipe) -> Played:
@@ -432,12 +435,7 @@ def open_loops(run: Path) -> list[Result]:
     """
     found = dict[str, Result]()
     read = [one for _, one in _read(run, OPEN_LOOP, OpenLoopFigures)]
-    # The episodes that were asked for: few frames may not reach all of them.
-    of = [
-        (one.figures["split"], one.settings.get("path"), one.settings.get("episodes"))
-        for one in read
-    ]
-    for one in _without_smaller(OPEN_LOOP, read, of):
+    for one in _without_smaller(OPEN_LOOP, read):
         # The path of the data may be written in several ways, and an earlier version did not record
         # single episodes.
         vary = ("data", "episode_errors")
@@ -446,27 +444,20 @@ def open_loops(run: Path) -> list[Result]:
     return sorted(found.values(), key=lambda one: one.figures["split"] != VALIDATION)
 
 
-def _without_smaller(kind: str, read: Sequence[Result], of: Sequence[Any]) -> list[Result]:
-    """The results without those that another by the same command makes superfluous.
-
-    It is of more questions, frames or episodes, and has every figure that they have.
-
-    Args:
-        of: for each result, what it is of; only equal ones are compared.
-    """
+def _without_smaller(kind: str, read: Sequence[Result]) -> list[Result]:
+    """The results without those that are part of a larger one by the same command."""
     name = _COUNTS[kind]
 
-    def is_superfluous(i: int) -> bool:
+    def is_superfluous(one: Result) -> bool:
         # `aegis run` measures what the recipe asks for; these results always stay.
-        return bool(read[i].settings) and any(
+        return bool(one.settings) and any(
             other.settings
-            and of[i] == of[j]
-            and other.figures.get(name, 0) > read[i].figures.get(name, 0)
-            and _told(read[i].figures) <= _told(other.figures)
-            for j, other in enumerate(read)
+            and other.figures.get(name, 0) > one.figures.get(name, 0)
+            and _is_part(kind, one, other)
+            for other in read
         )
 
-    return [one for i, one in enumerate(read) if not is_superfluous(i)]
+    return [one for one in read if not is_superfluous(one)]
 
 
 def _read(

@@ -93,7 +93,8 @@ def why_strong(weight: float, rate: float, option: str) -> str | None:
     Args:
         option: how a user sets the weight, such as `--set kfac.weight`.
     """
-    if weight <= _STRONG * rate:
+    # At a rate of 0 nothing is meant to learn.
+    if rate == 0 or weight <= _STRONG * rate:
         return None
     times = f"{weight / rate:,.0f} times the backbone's learning rate {rate:g}"
     return (

@@ -38,6 +38,39 @@ def test_what_is_free_is_known_on_linux_alone(monkeypatch: pytest.MonkeyPatch) -
     assert memory.free(CPU) is None
 
 
+def write_limits(place: Path, names: tuple[str, str], most: str, used: int, cached: str) -> None:
+    (place / names[0]).parent.mkdir(parents=True, exist_ok=True)
+    (place / names[0]).write_text(f"{most}\n", encoding="ascii")
+    (place / names[1]).write_text(f"{used}\n", encoding="ascii")
+    (place / names[0]).with_name("memory.stat").write_text(f"anon 7\n{cached}\n", encoding="ascii")
+
+
+@pytest.mark.parametrize(
+    ("names", "none", "cached"),
+    [
+        (("memory.max", "memory.current"), "max", "inactive_file 3000"),
+        (
+            ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes"),
+            "9223372036854771712",
+            "inactive_file 1\ntotal_inactive_file 3000",
+        ),
+    ],
+)
+def test_a_containers_limit_counts(
+    names: tuple[str, str], none: str, cached: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(memory, "_CGROUPS", tmp_path)
+    machine = memory.free(CPU)
+    assert machine is not None and machine > 20_000
+    write_limits(tmp_path, names, "15000", 10_000, cached)
+    assert memory.free(CPU) == 15_000 - 10_000 + 3_000
+    write_limits(tmp_path, names, "15000", 30_000, cached)
+    assert memory.free(CPU) == 0
+    write_limits(tmp_path, names, none, 10_000, cached)
+    found = memory.free(CPU)
+    assert found is not None and found > 20_000
+
+
 @pytest.mark.skipif(
     not hasattr(ctypes.CDLL(None), "mallinfo2"), reason="needs glibc 2.33, which tells what it maps"
 )

@@ -285,6 +285,25 @@ def test_a_probe_of_fewer_questions_does_not_replace_one_of_more(run: Path) -> N
     assert shown == [(40, None), (76, None), (12, True)]
 
 
+@pytest.mark.parametrize("other", [{"seed": 3}, {"ask": "Answer: {}"}, {"path": "/home/b.jsonl"}])
+def test_fewer_questions_that_were_asked_for_otherwise_are_shown_too(
+    run: Path, other: dict[str, Any]
+) -> None:
+    asked = {"vqa": "q", "path": "/home/q.jsonl", "seed": 0, "ask": "{}"}
+    for questions, changed in ((76, {}), (12, other), (9, {})):
+        found = probe_of(2.0) | {"questions": questions}
+        kept_with(run, "probe-q", found, **{**asked, **changed}, questions=questions)
+    shown = [found.figures["questions"] for found in results.probes(run)]
+    assert sorted(shown[1:], reverse=True) == [76, 12]
+
+
+def test_few_frames_under_other_names_are_shown_too(run: Path) -> None:
+    for frames, rename in ((120, None), (8, {"top": "front"})):
+        found, renamed = open_loop(1, frames=frames), {} if rename is None else {"rename": rename}
+        kept_with(run, f"evaluate-validation-arm{frames}", found, path="/home/arm", **renamed)
+    assert {found.figures["frames"] for found in results.open_loops(run)} == {120, 8}
+
+
 def test_paths_that_are_not_utf8_are_kept_and_read_back(run: Path) -> None:
     name = os.fsdecode(b"caf\xe9")
     for place, drop in (("home", 0), ("kitchen", 1), ("home", 2)):

@@ -84,13 +84,31 @@ def test_weights_that_a_repository_has_twice_are_fetched_once(
     assert {p.name for p in model_folder.fetch("org/name").iterdir()} == set(there[:2])
 
 
-@pytest.mark.parametrize("cached", [True, False])
+SHARDED = ("config.json", "model.safetensors.index.json", "model-1-of-2.safetensors")
+
+
+@pytest.mark.parametrize(
+    ("there", "cached"),
+    [
+        (("config.json", "model.safetensors"), True),
+        ((*SHARDED, "model-2-of-2.safetensors"), True),
+        (SHARDED, False),  # a download that was interrupted
+        (("config.json", "preprocessor_config.json"), False),
+        (("model.safetensors",), False),
+        ((), False),
+        (None, False),
+    ],
+)
 def test_whether_a_model_of_the_hub_is_here_is_found_without_a_download(
-    cached: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    there: tuple[str, ...] | None, cached: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
+    placed = {"weight_map": {"a": "model-1-of-2.safetensors", "b": "model-2-of-2.safetensors"}}
+    for name in there or ():
+        (tmp_path / name).write_text(json.dumps(placed if "index" in name else {}))
+
     def download(_: str, local_files_only: bool, **__: object) -> str:
         assert local_files_only
-        if not cached:
+        if there is None:
             raise FileNotFoundError("not in the cache")
         return str(tmp_path)
 
@@ -101,7 +119,7 @@ def test_whether_a_model_of_the_hub_is_here_is_found_without_a_download(
 
 
 @pytest.mark.parametrize(
-    "name", ["runs/none", "./x", "../x", "/no/x", "~/x", "none", "a/b/c", "models/x"]
+    "name", ["runs/none", "./x", "../x", "/no/x", "~/x", "nothing", "a/b/c", "models/x"]
 )
 def test_a_path_that_is_missing_is_never_asked_of_the_hub(
     name: str, bad: Bad, monkeypatch: pytest.MonkeyPatch

@@ -99,20 +99,21 @@ def test_a_training_and_its_dry_run_warn_of_bf16_that_the_processor_has_nothing_
 
 
 @pytest.mark.parametrize(
-    ("weight", "step", "method", "said_so"),
+    ("weight", "rate", "step", "method", "said_so"),
     [
-        (0.6, "proximal", "kfac", True),
-        (0.4, "proximal", "kfac", False),
-        (0.6, "gradient", "kfac", False),
-        (0.6, "proximal", "naive", False),
+        (0.6, 1e-3, "proximal", "kfac", True),
+        (0.4, 1e-3, "proximal", "kfac", False),
+        (0.6, 0.0, "proximal", "kfac", False),
+        (0.6, 1e-3, "gradient", "kfac", False),
+        (0.6, 1e-3, "proximal", "naive", False),
     ],
 )
 def test_a_training_and_its_dry_run_warn_of_a_pull_that_leaves_nothing_to_learn(
-    weight: float, step: str, method: str, said_so: bool, start: Start, recipe: Recipe,
+    weight: float, rate: float, step: str, method: str, said_so: bool, start: Start, recipe: Recipe,
     demos_file: Path, anchor_file: Path, tmp_path: Path,
 ) -> None:  # fmt: skip
     chosen = replace(recipe, kfac=replace(recipe.kfac, weight=weight, step=step))
-    wanted = replace(chosen, train=replace(chosen.train, steps=1))
+    wanted = replace(chosen, train=replace(chosen.train, steps=1, backbone_lr=rate))
     for stage in (dry_run, train):
         said: list[Event] = []
         given = (wanted, method, demos_file, anchor_file, tmp_path / stage.__name__)

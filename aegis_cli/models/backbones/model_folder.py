@@ -54,12 +54,15 @@ def fetch(name: str) -> Path:
 
 
 def is_cached(name: str) -> bool:
-    """Whether a model on the hub has been downloaded."""
+    """Whether a model on the hub has been downloaded, with all its weights."""
     try:
-        _snapshot(name, cached=True)
-    except (OSError, ValueError):
+        folder = _snapshot(name, cached=True)
+        indices = [files.load_json(path) for path in folder.glob("*.safetensors.index.json")]
+    except (OSError, ValueError, AegisError):
         return False
-    return True
+    there = {path.name for path in weights(folder)}
+    needed = {file for index in indices for file in index.get("weight_map", {}).values()}
+    return is_model(folder) and bool(there) and needed <= there
 
 
 def _snapshot(name: str, cached: bool = False) -> Path:

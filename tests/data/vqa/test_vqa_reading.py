@@ -183,6 +183,21 @@ def test_a_list_in_another_encoding_is_read_too(tmp_path: Path) -> None:
     assert len(sets.read(str(tmp_path / "set.json")).entries) == 3
 
 
+@pytest.mark.parametrize("place", ["begin", "end"])
+@pytest.mark.parametrize("form", ["items", "official"])
+@pytest.mark.parametrize("skip_bad", [True, False])
+def test_bytes_that_are_no_utf8_are_refused(
+    forms: Forms, form: str, place: str, skip_bad: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read_in_pieces(64, monkeypatch)
+    path = getattr(forms, form)(bad=False)
+    content = path.read_bytes()
+    at = content.index(b'": "') + 4 if place == "begin" else content.rindex(b'": "') + 4
+    path.write_bytes(content[:at] + b"\xe9" + content[at:])
+    with pytest.raises(AegisError, match="is not JSON"):
+        sets.read(str(path), skip_bad)
+
+
 @pytest.mark.parametrize("skip_bad", [True, False])
 @pytest.mark.parametrize("problem", ["none.png", "again"])
 def test_a_file_that_ends_too_soon_is_refused_for_that(
