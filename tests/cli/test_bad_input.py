@@ -159,7 +159,8 @@ def test_a_checkpoint_that_lost_a_part(bad: Callable[..., str], trained: Path, p
     (run / "checkpoints/last/expert.safetensors").write_bytes(b"")
     bad("rollout", "run", "--episodes", "1", says=("expert.safetensors", "truncated"))
     (run / "checkpoints/last/backbone/model.safetensors").unlink()
-    bad("probe", "run", "--questions", "7", says=("'run'",))
+    bad("probe", "run", "--questions", "7", says=("'run/checkpoints/last/",))
+    bad("probe", "run", "--questions", "7", "--baseline", "none", says=("'run'",))
     (run / "checkpoints/last").unlink()
     bad("rollout", "run", "--episodes", "1", says=("no checkpoint in 'run'", "aegis train"))
 
@@ -182,7 +183,7 @@ def test_an_anchor_of_another_backbone(bad: Callable[..., str], place: Path) -> 
         "anchor.safetensors",
         "--questions",
         "7",
-        says=(*says, "add --baseline embedded"),
+        says=(*says, "measured on: --baseline "),
     )
 
 

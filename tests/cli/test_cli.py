@@ -858,7 +858,7 @@ def test_ctrl_c_exits_130_and_says_how_to_resume(aegis, stage, recipe):
     assert aegis("run", recipe)[2].endswith(f"interrupted; resume with: aegis run {recipe}\n")
     again = aegis("run", recipe, "--overwrite")[2]
     assert again.endswith(f"interrupted; resume with: aegis run {recipe}\n")
-    for command, kept in (("probe", "answers so far"), ("rollout", "groups of episodes")):
+    for command, kept in (("probe", "answers so far"), ("rollout", "episodes so far")):
         said = aegis(command, "r")[2]
         assert f"interrupted; {kept}" in said and said.endswith(f"go on with: aegis {command} r\n")
     said = aegis("anchor", "--out", "x")[2]

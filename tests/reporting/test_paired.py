@@ -317,7 +317,7 @@ def test_episodes_of_another_seed_are_no_pairs(job: Path) -> None:
     "changes",
     [
         {"seed": 1},
-        {"frames": 6},
+        {"frames": 600},
         {"episode_errors": None},
         {"hold_error": 0.4},  # relative to the variance of other demonstrations
     ],

@@ -23,7 +23,12 @@ _SAMPLE = "Where is the RED block? It's 3.14 cm left of\n two cups: über, 東�
 
 
 def of(processor: Any) -> dict[str, str]:
-    """A processor's settings by name; one that is not called elsewhere meanwhile."""
+    """A processor's settings by name; one that is not called elsewhere meanwhile.
+
+    The stand-in of a model that was made from a shape alone has none.
+    """
+    if not hasattr(processor, "image_processor"):
+        return {}
     images, tokenizer = processor.image_processor, processor.tokenizer
     found = {name: value for name, value in images.to_dict().items() if _counts(name, value)}
     for name, value in vars(processor).items():
