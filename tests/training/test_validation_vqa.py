@@ -319,8 +319,8 @@ def test_a_loss_that_is_said_is_not_put_in_doubt_later(
 @pytest.mark.parametrize(
     ("gate", "found", "kept", "says"),
     [
-        ("mean", [5.0, 6.0, 7.0], 1, "to have lost at most 3 points of VQA (probe.max_drop): the one"),
-        ("upper", [0.0, 0.0, 0.0], 1, "(probe.max_drop) by the upper end of its interval (probe.gate): the"),
+        ("mean", [5.0, 6.0, 7.0], 1, "at most 3 points of VQA (probe.max_drop): the one"),
+        ("upper", [0.0, 0.0, 0.0], 1, " by the upper end of its interval (probe.gate): the"),
         ("mean", [5.0, 2.0, 7.0], 1, None),
         ("mean", [5.0, 6.0, 7.0], None, None),  # all of them are there to choose from
     ],
