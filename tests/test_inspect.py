@@ -273,6 +273,49 @@ def test_checkpoints_are_listed_by_their_steps(tmp_path):
     assert inspection.run(run).facts["checkpoints"] == steps
 
 
+VQA = {"vqa_accuracy": 0.9, "vqa_cross_entropy": 0.3, "vqa_drop_low": -1, "vqa_drop_high": 9}
+
+
+def test_what_was_measured_of_each_checkpoint_is_a_table_that_marks_the_best(tmp_path, capsys):
+    run = save_run(tmp_path / "run")
+    probe = Probe(while_training=9, max_drop=2.0)
+    (run / "recipe.yaml").write_text(to_yaml(Recipe(name="small", task="point", probe=probe)))
+    lines = [{"step": 1, "loss": 3}, {"step": 2, "validation_loss": 0.25} | VQA]
+    lines += [{"step": 3, "validation_loss": 0.5} | VQA]
+    for line, drop in zip(lines, (0, 2.5, 1.25), strict=True):
+        line |= {"vqa_drop_points": drop} if "vqa_accuracy" in line else {}
+    lines[2] |= {"rollout_success": 0.75, "rollout_low": 0.7, "rollout_high": 0.8}
+    lines[2] |= {"action_error": 0.125}
+    log = run / "metrics.jsonl"
+    log.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    for step in (1, 2, 3):
+        folder = run / "checkpoints" / f"{step:06d}"
+        folder.mkdir(exist_ok=True)
+        artifacts.save(folder / "expert.safetensors", "expert", {"w": torch.zeros(1)})
+    first, second, third = inspection.run(run).by_checkpoint
+    assert (first.name, first.validation_loss, first.drop_points, first.best) == (
+        "000001",
+        None,
+        {},
+        False,
+    )
+    assert (second.validation_loss, second.drop_points, second.success) == (
+        0.25,
+        {"scenes": 2.5},
+        None,
+    )
+    # The second has the lowest loss, and has lost more than the recipe allows.
+    assert (second.best, third.best) == (False, True)
+    text = shown(capsys, run)
+    assert "Lost of scenes (points)" in text and "Success %" in text
+    rows = {line.split()[0]: line.split()[1:] for line in text.splitlines() if " 0000" in line}
+    assert rows["000001"] == ["-"] * 4
+    assert rows["000002"] == ["0.25", "2.50", "-", "-"]
+    assert rows["000003"] == ["(best)", "0.5", "1.25", "75.0", "0.125"]
+    log.write_text("".join(json.dumps(line) + "\n" for line in lines[:2]))
+    assert inspection.run(run).by_checkpoint == ()  # one measured checkpoint is no choice
+
+
 def refusal(path: Path) -> AegisError:
     with pytest.raises(AegisError) as caught:
         inspection.run(path)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from typing import TypeVar
+
+Item = TypeVar("Item")
 
 
 @dataclass(frozen=True)
@@ -35,6 +38,32 @@ OnEvent = Callable[[Event], None]
 
 def ignore(_: Event) -> None:
     """The default listener: a stage called as a library function stays silent."""
+
+
+class Tally:
+    """Reports the progress of many small units, once in `every` of them and at the end.
+
+    Fewer than `every` are over in no time, and nothing is reported.
+    """
+
+    def __init__(self, stage: str, total: int, unit: str, every: int, on_event: OnEvent) -> None:
+        self._stage, self._total, self._unit, self._every = stage, total, unit, every
+        self._on_event = on_event
+        self._done, self._reported = 0, 0
+
+    def advance(self, count: int = 1) -> None:
+        """Count `count` more units."""
+        self._done += count
+        is_due = self._done - self._reported >= self._every or self._done == self._total
+        if self._total >= self._every and is_due:
+            self._reported = self._done
+            self._on_event(Progress(self._stage, self._done, self._total, self._unit))
+
+    def each(self, items: Iterable[Item]) -> Iterator[Item]:
+        """The items, each counted after it was used."""
+        for item in items:
+            yield item
+            self.advance()
 
 
 @contextmanager

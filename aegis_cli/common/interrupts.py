@@ -112,11 +112,17 @@ def _sending_again() -> Generator[None]:
         if not isinstance(dropped.exc_value, Stopped):
             usual(dropped)
             return
-        # Not at once, because the handler would raise into this very hook.
-        timer = threading.Timer(_AGAIN_S, os.kill, (os.getpid(), dropped.exc_value.number))
-        timer.daemon = True
-        timers.append(timer)
-        timer.start()
+        # Not at once, because the handler would raise into this very hook. On a busy machine the
+        # time may be over before `start` returns; then it raises here, and is sent once more.
+        while True:
+            timer = threading.Timer(_AGAIN_S, os.kill, (os.getpid(), dropped.exc_value.number))
+            timer.daemon = True
+            timers.append(timer)
+            try:
+                timer.start()
+            except Stopped:
+                continue
+            return
 
     sys.unraisablehook = hook
     try:

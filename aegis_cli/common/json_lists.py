@@ -6,7 +6,11 @@ import codecs
 import json
 import re
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any, BinaryIO
+
+from aegis_cli.common import files
+from aegis_cli.common.errors import AegisError
 
 CHUNK = 2**22  # bytes that are read at a time
 _DECODE = json.JSONDecoder().raw_decode
@@ -22,6 +26,34 @@ class Unusual(ValueError):
     """The file is not JSON, or not in the form that is read in pieces: read it whole."""
 
 
+def read_list(
+    path: Path,
+    key: str | None,
+    rest: dict[str, Any],
+    on_read: Read,
+    of_whole: Callable[[], list[Any]],
+) -> Iterator[Any]:
+    """The items of the list that a file holds, in pieces or, in an unusual file, read whole.
+
+    Args:
+        key, rest: as in `items`.
+        of_whole: reads the list of an unusual file, or raises the error in that file.
+
+    Raises:
+        AegisError: the file is unusable, which may show only after many items.
+    """
+    given = 0
+    with files.reading(path, "check the path"), open(path, "rb") as file:
+        try:
+            for item in items(file, key, rest, on_read):
+                yield item
+                given += 1
+            return
+        except Unusual:
+            pass
+    yield from of_whole()[given:]
+
+
 def items(file: BinaryIO, key: str | None, rest: dict[str, Any], on_read: Read) -> Iterator[Any]:
     """The items of the list that a file holds.
 
@@ -32,6 +64,7 @@ def items(file: BinaryIO, key: str | None, rest: dict[str, Any], on_read: Read) 
 
     Raises:
         Unusual: at any point of the file, maybe after many items.
+        AegisError: the list occurs twice.
     """
     if json.detect_encoding(file.read(4)) not in ("utf-8", "utf-8-sig"):
         raise Unusual("another encoding")
@@ -41,7 +74,7 @@ def items(file: BinaryIO, key: str | None, rest: dict[str, Any], on_read: Read) 
         if key is None:
             yield from text.listed()
         else:
-            yield from _of_object(text, key, rest)
+            yield from _of_object(text, key, rest, file.name)
         text.end()
     except RecursionError:
         raise Unusual("nested too deep") from None
@@ -51,15 +84,18 @@ def items(file: BinaryIO, key: str | None, rest: dict[str, Any], on_read: Read) 
         raise Unusual(str(error)) from error
 
 
-def _of_object(text: _Text, key: str, rest: dict[str, Any]) -> Iterator[Any]:
+def _of_object(text: _Text, key: str, rest: dict[str, Any], path: str) -> Iterator[Any]:
     """The items of the list under a key; the object's other values go into `rest`."""
     seen = False
     text.take("{")
     while True:
         name = text.value()
         text.take(":")
-        if not isinstance(name, str) or (seen and name == key):
-            raise Unusual("a key that is no text, or the list twice")
+        if not isinstance(name, str):
+            raise Unusual("a key that is no text")
+        if seen and name == key:
+            # JSON readers take the last one, after these items were taken of the first.
+            raise AegisError(f"'{path}' has the key '{key}' twice", "it once", "correct the file")
         if name == key and text.peek() == "[":
             seen = True
             yield from text.listed()
@@ -78,11 +114,11 @@ class _Text:
 
     def __init__(self, file: BinaryIO, on_read: Read) -> None:
         self._file, self._on_read = file, on_read
-        self._decoder = codecs.getincrementaldecoder("utf-8")("surrogatepass")
+        # It leaves out a byte-order mark, also one that is read in parts.
+        self._decoder = codecs.getincrementaldecoder("utf-8-sig")("surrogatepass")
         self._text, self._at = "", 0
         self._bytes, self._is_whole = 0, False
         self._more()
-        self._text = self._text.removeprefix("\ufeff")
 
     def _more(self) -> None:
         """Read on. An item longer than what is read at a time doubles that."""

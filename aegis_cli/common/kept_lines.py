@@ -6,12 +6,15 @@ add to it at once.
 
 from __future__ import annotations
 
+import base64
 import contextlib
 import json
 import os
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from aegis_cli.common import cache, files
 from aegis_cli.common.errors import AegisError
@@ -80,6 +83,19 @@ def unsealed(line: Mapping[str, Any]) -> dict[str, Any] | None:
         if files.sha256_value(said) == line.get(_SEAL):
             return said
     return None
+
+
+def packed(array: np.ndarray) -> dict[str, Any]:
+    """An array as JSON, bit for bit."""
+    said = base64.b64encode(np.ascontiguousarray(array).tobytes()).decode()
+    return {"type": array.dtype.str, "shape": list(array.shape), "bytes": said}
+
+
+def unpacked(said: Mapping[str, Any]) -> np.ndarray:
+    """The array that was packed."""
+    flat = np.frombuffer(base64.b64decode(said["bytes"]), np.dtype(said["type"]))
+    # A copy, since an array over bytes cannot be written, of which torch warns.
+    return flat.reshape(said["shape"]).copy()
 
 
 def _ends_a_line(path: Path) -> bool:

@@ -13,12 +13,11 @@ from typing import Any
 
 from aegis_cli.common import files
 from aegis_cli.common.errors import AegisError
-from aegis_cli.common.events import OnEvent
+from aegis_cli.common.events import OnEvent, Tally
 from aegis_cli.evaluation.question_log import (
     Evaluation,
     Harness,
     QuestionLog,
-    Reading,
     Tasks,
     newest,
 )
@@ -67,7 +66,7 @@ def _named(path: Path) -> tuple[str, str] | None:
     return None
 
 
-def read(task: str, paths: Mapping[str, Path], reading: Reading) -> QuestionLog:
+def read(task: str, paths: Mapping[str, Path], tally: Tally) -> QuestionLog:
     """Read a task's lines, which are in one file.
 
     Raises:
@@ -79,7 +78,7 @@ def read(task: str, paths: Mapping[str, Path], reading: Reading) -> QuestionLog:
         for number, line in enumerate(file, start=1):
             if line.strip():
                 _add(log, number, line)
-            reading.read(len(line))
+            tally.advance(len(line))
     if not log.asked:
         fix = "evaluate again: the harness wrote an empty file"
         raise AegisError(f"no question in '{path}'", WRITTEN, fix)

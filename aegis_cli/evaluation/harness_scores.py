@@ -21,7 +21,7 @@ from aegis_cli.common.events import OnEvent, Warned, ignore
 from aegis_cli.data.vqa.gate import MEAN, passes
 from aegis_cli.data.vqa.metrics import mean_loss_interval
 from aegis_cli.evaluation import harness_samples, probe, vlmevalkit_tables
-from aegis_cli.evaluation.question_log import Harness, QuestionLog, Reading, Tasks
+from aegis_cli.evaluation.question_log import Harness, QuestionLog, Tasks, tally_of
 
 _HARNESSES = (harness_samples.HARNESS, vlmevalkit_tables.HARNESS)
 _WRITTEN = f"{harness_samples.WRITTEN}, or {vlmevalkit_tables.WRITTEN}"
@@ -110,11 +110,11 @@ def run(
     scores: list[ScoreDrop] = []
     tasks = sorted((first.keys() & second.keys()) - why.keys())
     both = [path for task in tasks for own in (first, second) for path in own[task].values()]
-    reading = Reading(both, on_event)
+    tally = tally_of(both, on_event)
     for task in tasks:
         logs = (
-            harness.read(task, first[task], reading),
-            harness.read(task, second[task], reading),
+            harness.read(task, first[task], tally),
+            harness.read(task, second[task], tally),
         )
         _warn_of_doubts(task, logs, on_event)
         metrics, unfit = _comparable(task, logs, max_drop, on_event)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from aegis_cli.common.errors import AegisError
-from aegis_cli.common.events import OnEvent, Progress, Warned
+from aegis_cli.common.events import OnEvent, Tally, Warned
 
 _TOLD_BYTES = 1_000_000  # bytes read between two progress events
 
@@ -82,19 +82,10 @@ class QuestionLog:
     doubts: dict[str, set[str]] = field(default_factory=lambda: defaultdict(set))
 
 
-class Reading:
+def tally_of(paths: Sequence[Path], on_event: OnEvent) -> Tally:
     """Reports how much of all files has been read; a benchmark's may have gigabytes."""
-
-    def __init__(self, paths: Sequence[Path], on_event: OnEvent) -> None:
-        self._total = sum(path.stat().st_size for path in paths)
-        self._done, self._told, self._on_event = 0, 0, on_event
-
-    def read(self, size: int) -> None:
-        """Count `size` more bytes."""
-        self._done += size
-        if self._done - self._told >= _TOLD_BYTES or self._done == self._total:
-            self._told = self._done
-            self._on_event(Progress("scores", self._done, self._total, "bytes"))
+    total = sum(path.stat().st_size for path in paths)
+    return Tally("scores", total, "bytes", _TOLD_BYTES, on_event)
 
 
 @dataclass(frozen=True)
@@ -111,4 +102,4 @@ class Harness:
     name: str
     holds: Callable[[Path], bool]
     find: Callable[[Path, OnEvent], Tasks]
-    read: Callable[[str, Mapping[str, Path], Reading], QuestionLog]
+    read: Callable[[str, Mapping[str, Path], Tally], QuestionLog]

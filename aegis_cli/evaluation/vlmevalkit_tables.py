@@ -20,12 +20,11 @@ from typing import Any
 
 from aegis_cli.common import tables
 from aegis_cli.common.errors import AegisError
-from aegis_cli.common.events import OnEvent, Progress, ignore
+from aegis_cli.common.events import OnEvent, Progress, Tally, ignore
 from aegis_cli.evaluation.question_log import (
     Evaluation,
     Harness,
     QuestionLog,
-    Reading,
     Tasks,
     newest,
 )
@@ -206,7 +205,7 @@ def _verdicts(columns: Sequence[str]) -> list[str]:
     return [name for name in judged if name in _VERDICTS or name == _MATCHES]
 
 
-def read(task: str, paths: Mapping[str, Path], reading: Reading) -> QuestionLog:
+def read(task: str, paths: Mapping[str, Path], tally: Tally) -> QuestionLog:
     """The verdicts on a benchmark's predictions, from all its judged tables.
 
     Raises:
@@ -215,7 +214,7 @@ def read(task: str, paths: Mapping[str, Path], reading: Reading) -> QuestionLog:
     log = QuestionLog(next(iter(paths.values())))
     for judged, path in paths.items():
         _add(log, task, judged, path)
-        reading.read(path.stat().st_size)
+        tally.advance(path.stat().st_size)
     return log
 
 

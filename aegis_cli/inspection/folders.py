@@ -22,6 +22,7 @@ from aegis_cli.evaluation import kept_figures, results
 from aegis_cli.evaluation.results import Result
 from aegis_cli.inspection import figures, file
 from aegis_cli.inspection.report import (
+    CheckpointFigures,
     InspectReport,
     StreamInspection,
     TensorInfo,
@@ -33,6 +34,7 @@ from aegis_cli.recipes import Demos, Recipe
 from aegis_cli.training import (
     checkpoint,
     folder,
+    retention,
     validation_actions,
     validation_rollout,
     validation_vqa,
@@ -190,7 +192,38 @@ def _run_folder(path: Path, at: Path | None = None) -> InspectReport:
         validation_loss=metrics.get("validation_loss"),
         **figures.of_ledger(rows, until),
     )
-    return report if at is not None else _with_results(report, path, settings)
+    if at is not None:
+        return report
+    # A merged run has a single checkpoint, and the log of the training before the merge.
+    by_checkpoint = () if merged else _by_checkpoint(path, settings)
+    report = dataclasses.replace(report, by_checkpoint=by_checkpoint)
+    return _with_results(report, path, settings)
+
+
+def _by_checkpoint(path: Path, settings: Recipe) -> tuple[CheckpointFigures, ...]:
+    """What was measured of each checkpoint of a run while it trained."""
+    names = {int(at.name): at.name for at in checkpoint.whole(path)}
+    best = retention.best(path, names, settings).step
+    lines: dict[int, dict[str, Any]] = {}
+    for line in folder.read_metrics(path, "step"):
+        lines.setdefault(line["step"], {}).update(line)
+    found = []
+    for step, name in names.items():
+        line = lines.get(step, {})
+        asked = validation_vqa.of_line(settings, line)
+        acted = validation_rollout.of_line(line)
+        figures_of_step = CheckpointFigures(
+            name=name,
+            validation_loss=line.get("validation_loss"),
+            drop_points={name: told["drop_points"] for name, told in asked.items()},
+            success=acted.get("success"),
+            mean_return=acted.get("mean_return"),
+            relative_error=validation_actions.of_line(line).get("relative_error"),
+            best=step == best,
+        )
+        found.append(figures_of_step)
+    measured = [figures_of_step.validation_loss is not None for figures_of_step in found]
+    return tuple(found) if sum(measured) > 1 else ()
 
 
 def _with_results(report: InspectReport, path: Path, settings: Recipe) -> InspectReport:

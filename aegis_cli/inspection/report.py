@@ -7,6 +7,7 @@ which experts were used and which were pruned, per task and map.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -94,6 +95,28 @@ class Bin:
     layers: tuple[float, ...]
 
 
+@dataclass(frozen=True)
+class CheckpointFigures:
+    """What a run measured of one of its checkpoints while it trained.
+
+    Attributes:
+        name: the checkpoint's folder within `checkpoints`.
+        validation_loss: None if it was not measured at this step.
+        drop_points: by question set, the points of VQA accuracy lost; empty if none was asked.
+        success, mean_return: in validation episodes; None if none were played.
+        relative_error: of actions predicted at held-out frames; None if none were predicted.
+        best: whether this is the checkpoint that `train.keep_checkpoints` keeps as the best.
+    """
+
+    name: str
+    validation_loss: float | None
+    drop_points: Mapping[str, float]
+    success: float | None
+    mean_return: float | None
+    relative_error: float | None
+    best: bool
+
+
 class UnknownFolder(AegisError):
     """A folder that is of no known kind, whatever it contains."""
 
@@ -108,6 +131,8 @@ class InspectReport:
         frozen: the layers without trained parameters, which have no energies.
         energy_shed_mean: None, with `layers`, `frozen` and `over_time` empty, if no anchor gradient
             was taken.
+        by_checkpoint: of a run that was not merged, what was measured of each checkpoint while it
+            trained; empty if fewer than two were measured.
         probes, rollouts, open_loops: what was measured of a run's last checkpoint.
         question_sets: the question set of each probe, as the user named it.
         gate: whether the drop is within the run's `probe.max_drop` or `--max-drop`.
@@ -127,6 +152,7 @@ class InspectReport:
     energy_shed_mean: float | None = None
     loss: float | None = None
     validation_loss: float | None = None
+    by_checkpoint: tuple[CheckpointFigures, ...] = ()
     probes: tuple[Result, ...] = ()
     rollouts: tuple[PlayedResult, ...] = ()
     open_loops: tuple[Result, ...] = ()

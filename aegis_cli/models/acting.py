@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import itertools
 import math
 import time
@@ -300,20 +299,13 @@ class _Begun(NamedTuple):
 
 def _line_begun(numbers: Sequence[int], begun: _Begun) -> dict[str, Any]:
     """The beginning of a group as a stored line."""
-    decided = []
-    for chunk in begun.decided:
-        raw = base64.b64encode(np.ascontiguousarray(chunk).tobytes()).decode()
-        decided.append({"type": chunk.dtype.str, "shape": chunk.shape, "bytes": raw})
+    decided = [kept_lines.packed(chunk) for chunk in begun.decided]
     line = {"first": numbers[0], "count": len(numbers), "seconds": begun.seconds}
     return kept_lines.sealed(line | {"decided": decided})
 
 
 def _read_begun(line: Mapping[str, Any]) -> _Begun:
-    decided = []
-    for chunk in line["decided"]:
-        flat = np.frombuffer(base64.b64decode(chunk["bytes"]), np.dtype(chunk["type"]))
-        # A copy, since torch warns of memory that cannot be written.
-        decided.append(flat.reshape(chunk["shape"]).copy())
+    decided = [kept_lines.unpacked(chunk) for chunk in line["decided"]]
     return _Begun(decided, float(line["seconds"]))
 
 

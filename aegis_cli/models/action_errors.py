@@ -5,10 +5,8 @@ Each prediction starts from a recorded frame, and nothing is executed.
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -62,32 +60,19 @@ def predict(
             seen = batch.images, batch.instructions, batch.proprio
             found[first] = policy.act_from(*seen, part, None, inputs).cpu()
             if kept is not None:
-                kept.add([_line(first, found[first])])
+                line = {"first": first, "predicted": kept_lines.packed(found[first].numpy())}
+                kept.add([kept_lines.sealed(line)])
             done += len(batch)
             on_event(Progress(stage, done, len(at), "frames"))
     return torch.cat([found[first] for first in sorted(found)])
-
-
-def _line(first: int, chunks: torch.Tensor) -> dict[str, Any]:
-    """A batch's chunks as they are kept, bit for bit."""
-    raw = chunks.contiguous().view(torch.uint8).numpy().tobytes()
-    line = {
-        "first": first,
-        "shape": list(chunks.shape),
-        "dtype": str(chunks.dtype).removeprefix("torch."),
-        "chunks": base64.b64encode(raw).decode(),
-    }
-    return kept_lines.sealed(line)
 
 
 def _kept(kept: KeptLines) -> Iterator[tuple[int, torch.Tensor]]:
     """The batches that are kept whole, by the place of the first frame; others are left out."""
     for line in kept.read():
         said = kept_lines.unsealed(line)
-        if said is not None:
-            raw = bytearray(base64.b64decode(said["chunks"]))
-            flat = torch.frombuffer(raw, dtype=getattr(torch, said["dtype"]))
-            yield said["first"], flat.view(said["shape"])
+        if said is not None and "predicted" in said:  # earlier versions wrote other keys
+            yield said["first"], torch.from_numpy(kept_lines.unpacked(said["predicted"]))
 
 
 def training_std(policy: Policy, meta: PolicyMeta) -> np.ndarray:

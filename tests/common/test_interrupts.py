@@ -81,6 +81,24 @@ def test_a_signal_whose_exception_a_c_library_drops_comes_again(number: int) -> 
     assert caught.value.number == number
 
 
+def test_a_dropped_signal_comes_again_though_it_is_sent_while_its_timer_starts(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    start, started = threading.Timer.start, list[threading.Timer]()
+
+    def too_late(timer: threading.Timer) -> None:
+        started.append(timer)
+        if len(started) == 1:
+            send(signal.SIGTERM)
+        start(timer)
+
+    monkeypatch.setattr(threading.Timer, "start", too_late)
+    with pytest.raises(Stopped), listening():
+        ctypes.CFUNCTYPE(None)(lambda: send(signal.SIGTERM))()
+        time.sleep(10)
+    assert len(started) == 2
+
+
 def test_other_exceptions_that_are_dropped_are_told_as_ever(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -28,6 +28,8 @@ def inspect(report: Any, tensors: bool = False) -> RenderableType:
     facts = {"kind": report.kind, "path": report.path, **_as_they_are_read(told)}
     facts["energy_shed_mean"] = report.energy_shed_mean  # no line if it is None
     parts: list[RenderableType] = [pairs(facts), *measured_while_it_trained]
+    if report.by_checkpoint:
+        parts.append(_checkpoints(report.by_checkpoint))
     if report.kind == "run":
         parts += _measured(report)
     if report.tensors and not tensors:
@@ -130,6 +132,26 @@ def _steps_taken(steps: int | None, planned: int | None) -> str:
     from aegis_cli.inspection import steps_taken  # imports safetensors, which --help must not
 
     return steps_taken(steps, planned)
+
+
+def _checkpoints(found: Sequence[Any]) -> Table:
+    """What was measured of each checkpoint while the run trained; the best one is marked."""
+    columns: dict[str, list[Cell]] = {
+        "Checkpoint": [f"{x.name} (best)" if x.best else x.name for x in found],
+        "Validation loss": [number(x.validation_loss) for x in found],
+    }
+    for name in dict.fromkeys(name for x in found for name in x.drop_points):
+        columns[f"Lost of {name} (points)"] = [fixed(x.drop_points.get(name), 2) for x in found]
+    shown: Mapping[str, tuple[str, Callable[[float | None], str]]] = {
+        "success": ("Success %", percent),
+        "mean_return": ("Mean return", number),
+        "relative_error": ("Error of held-out actions", number),
+    }
+    for attribute, (head, show) in shown.items():
+        values = [getattr(x, attribute) for x in found]
+        if any(value is not None for value in values):
+            columns[head] = [show(value) for value in values]
+    return plain_table(tuple(columns), list(zip(*columns.values(), strict=True)))
 
 
 def _measured(report: Any) -> list[RenderableType]:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
 from aegis_cli.common.errors import AegisError
-from aegis_cli.common.events import OnEvent, Progress
+from aegis_cli.common.events import OnEvent, Tally
 from aegis_cli.common.files import sha256_file
 from aegis_cli.data.vqa.images import Picture
 
@@ -30,10 +30,9 @@ def shared(
     pairs: list[tuple[Picture, Picture]] = []
     for told in tells:
         total = len(held_out) + len(others)
-        mine = dict(_told(held_out, told, on_event, 0, total))
-        theirs = dict(_told(others, told, on_event, len(held_out), total))
-        if total >= _EVERY:  # complete the progress
-            on_event(Progress("compare pictures", total, total, "files"))
+        tally = Tally("compare pictures", total, "files", _EVERY, on_event)
+        mine = dict(_told(tally.each(held_out), told))
+        theirs = dict(_told(tally.each(others), told))
         first = {value: picture for picture, value in reversed(theirs.items())}
         pairs = [(picture, first[value]) for picture, value in mine.items() if value in first]
         alike = {*mine.values()}
@@ -42,17 +41,9 @@ def shared(
     return pairs
 
 
-def _told(
-    pictures: Sequence[Picture], told: Told, on_event: OnEvent, before: int, total: int
-) -> Iterator[tuple[Picture, int | bytes | str]]:
-    """The result of `told` for each picture's file; unreadable files are skipped.
-
-    Args:
-        before: how many of the `total` files were processed before these.
-    """
-    for number, picture in enumerate(pictures, before + 1):
-        if number % _EVERY == 0:
-            on_event(Progress("compare pictures", number, total, "files"))
+def _told(pictures: Iterable[Picture], told: Told) -> Iterator[tuple[Picture, int | bytes | str]]:
+    """The result of `told` for each picture's file; unreadable files are skipped."""
+    for picture in pictures:
         if isinstance(picture.source, Path):
             try:
                 yield picture, told(picture.source)

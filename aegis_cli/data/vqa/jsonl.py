@@ -88,19 +88,14 @@ def _listed(path: Path, on_read: Callable[[int], None]) -> Iterator[Any]:
     Raises:
         AegisError: the file is not JSON, which may be found out after many items.
     """
-    given = 0
-    with files.reading(path, "check the path"), open(path, "rb") as file:
-        try:
-            for item in json_lists.items(file, None, {}, on_read):
-                yield item
-                given += 1
-        except json_lists.Unusual:
-            listed = files.load_json(path)  # which raises the error, if there is one
-            if not isinstance(listed, list):
-                raise AegisError(
-                    f"no list in '{path}'", "a list of questions", "check the path"
-                ) from None
-            yield from listed[given:]
+    return json_lists.read_list(path, None, {}, on_read, partial(_whole_list, path))
+
+
+def _whole_list(path: Path) -> list[Any]:
+    listed = files.load_json(path)
+    if not isinstance(listed, list):
+        raise AegisError(f"no list in '{path}'", "a list of questions", "check the path")
+    return listed
 
 
 def _check(path: Path, on_event: OnEvent) -> None:

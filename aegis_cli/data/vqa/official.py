@@ -10,10 +10,10 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 from aegis_cli.common import files, json_lists
 from aegis_cli.common.errors import AegisError
@@ -30,7 +30,6 @@ from aegis_cli.data.vqa.entries import (
 from aegis_cli.data.vqa.images import Picture
 
 SUFFIX = "questions.json"
-Taken = TypeVar("Taken")
 _EVERY = 10_000  # questions between two reports of progress
 
 
@@ -74,10 +73,10 @@ class _Annotation(NamedTuple):
 def _read(path: Path, annotations: Path, on_event: OnEvent, on_read: OnRead) -> Iterator[Read]:
     """Each question with its annotation, then an error for each annotation without a question."""
     about: dict[str, Any] = {}
-    questions = _taken(path, "questions", list, on_event, about)
+    questions = list(_listed(path, "questions", on_event, about))
     images = _Images(path, about.get("data_subtype"))
     # A file that is no JSON is refused for that, which its end may tell.
-    told, problems = _taken(annotations, "annotations", partial(_told, annotations), on_event, {})
+    told, problems = _told(annotations, _listed(annotations, "annotations", on_event, {}))
     yield from problems
     for number, row in enumerate(questions, start=1):
         if number % _EVERY == 0:
@@ -95,28 +94,18 @@ def _read(path: Path, annotations: Path, on_event: OnEvent, on_read: OnRead) -> 
         )
 
 
-def _taken(
-    path: Path,
-    key: str,
-    take: Callable[[Iterable[Any]], Taken],
-    on_event: OnEvent,
-    about: dict[str, Any],
-) -> Taken:
-    """What is taken of the rows that an official file has under a key.
+def _listed(path: Path, key: str, on_event: OnEvent, about: dict[str, Any]) -> Iterator[Any]:
+    """The rows that an official file has under a key; its other values go into `about`."""
 
-    Args:
-        take: called with the rows; if they turn out to be unusual, again with all of them.
-        about: filled with the file's other values.
-    """
-    with files.reading(path, "check the path"), open(path, "rb") as file:
-        on_read = in_mb(f"read {key}", path.stat().st_size, on_event)
-        try:
-            return take(json_lists.items(file, key, about, on_read))
-        except json_lists.Unusual:
-            pass
-    whole = _load(path)
-    about |= whole
-    return take(_rows(path, whole, key))
+    def of_whole() -> list[Any]:
+        whole = _load(path)
+        rows = _rows(path, whole, key)
+        about.update(whole)
+        return rows
+
+    with files.reading(path, "check the path"):
+        size = path.stat().st_size
+    return json_lists.read_list(path, key, about, in_mb(f"read {key}", size, on_event), of_whole)
 
 
 def _told(

@@ -9,13 +9,13 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
 from aegis_cli.common import files, hub, media
 from aegis_cli.common.errors import AegisError
-from aegis_cli.common.events import OnEvent, Progress, ignore
+from aegis_cli.common.events import Item, OnEvent, Progress, Tally, ignore
 from aegis_cli.data.vqa import easy, sets
 from aegis_cli.data.vqa.answers import normalise
 from aegis_cli.data.vqa.entries import Entry
@@ -28,7 +28,6 @@ SHOWN = 6  # images on a sheet
 _PARTS = ("anchor", "validation", "probe")  # co-training uses the anchors' images
 _TILE, _TEXT = 384, 13  # pixels
 _EVERY = 20_000  # questions or images between two reports of progress
-Item = TypeVar("Item")
 
 
 @dataclass(frozen=True)
@@ -123,7 +122,7 @@ def of_set(name: str, images: bool = False, on_event: OnEvent = ignore) -> Quest
     entries = found.entries
     words, answer_words = array("I"), array("I")
     given, families, said = set[int](), Counter[str](), Counter[str]()
-    for entry in _told(entries, "count", "questions", on_event):
+    for entry in _counted(entries, "count", "questions", on_event):
         question = entry.question
         words.append(len(question.text.split()))
         answer_words.append(len(question.answer.split()))
@@ -142,7 +141,7 @@ def of_set(name: str, images: bool = False, on_event: OnEvent = ignore) -> Quest
         problems=_first(found.problems),
         repeated=sum(
             _repeated(entries, key)
-            for key in _told(entries.images, "compare questions", "images", on_event)
+            for key in _counted(entries.images, "compare questions", "images", on_event)
         ),
         words=_words(words),
         answer_words=_words(answer_words),
@@ -157,12 +156,8 @@ def of_set(name: str, images: bool = False, on_event: OnEvent = ignore) -> Quest
     )
 
 
-def _told(items: Sequence[Item], stage: str, unit: str, on_event: OnEvent) -> Iterator[Item]:
-    """The items; of many it is told how many are done."""
-    for done, item in enumerate(items, start=1):
-        yield item
-        if len(items) >= _EVERY and (done % _EVERY == 0 or done == len(items)):
-            on_event(Progress(stage, done, len(items), unit))
+def _counted(items: Sequence[Item], stage: str, unit: str, on_event: OnEvent) -> Iterator[Item]:
+    return Tally(stage, len(items), unit, _EVERY, on_event).each(items)
 
 
 def _repeated(entries: Entries, key: str) -> int:
