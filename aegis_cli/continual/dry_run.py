@@ -19,13 +19,13 @@ from aegis_cli.common import commands, devices, launch, memory, prefetch
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Progress, ignore, loading_told
 from aegis_cli.common.ranks import ALONE
-from aegis_cli.continual import files, loop, robot_demos, robots, state, train
+from aegis_cli.continual import files, loop, more_tasks, robot_demos, robots, state, train
 from aegis_cli.continual.loop import TaskTraining
 from aegis_cli.continual.robots import RobotStreamRun
 from aegis_cli.continual.state import TaskInProgress
 from aegis_cli.core.routing import traced
 from aegis_cli.recipes import RobotStreamRecipe
-from aegis_cli.training import folder, optimizers
+from aegis_cli.training import optimizers
 from aegis_cli.training.dry_run import (
     MB,
     TIMED_STEPS,
@@ -115,7 +115,7 @@ def run(
     """
     launch.check_one()
     out, device = Path(out), devices.pick()
-    folder.check(out, recipe, resume, overwrite, train.read_by(recipe))
+    more_tasks.check(out, recipe, resume, overwrite, train.read_by(recipe))
     recipe = _recorded(recipe, out)
     # Measured before this process allocates any.
     free, base = memory.free(device), memory.restart_peak(device)
@@ -184,9 +184,9 @@ def _left(stream: RobotStreamRun, overwrite: bool) -> list[int]:
     """How many steps of each task are still to be taken."""
     steps, count, place = stream.recipe.train.steps, len(stream.names), TaskInProgress()
     saved = stream.out / state.STATE
-    if files.is_done(stream.out) and not overwrite:
-        return [0] * count
-    if saved.is_file() and not overwrite:
+    if not overwrite and (learned := files.learned(stream.out)):
+        place = TaskInProgress(task=learned)  # of all tasks, or of those that others are added to
+    elif saved.is_file() and not overwrite:
         place = state.place_in(saved)
     before = [0] * place.task
     return [*before, *([steps - place.step] if place.task < count else []), *[steps] * count][

@@ -31,7 +31,24 @@ _NOT_KEPT = ("out", "minutes")  # fields of a report that differ between equal r
 
 def is_done(path: Path) -> bool:
     """Whether a run folder holds a stream that was learned to its end."""
-    return (path / REPORT).is_file()
+    return learned(path) > 0
+
+
+def learned(path: Path) -> int:
+    """How many tasks a finished stream has learned; 0 if the folder holds none.
+
+    A run to which tasks are being added is not finished, even if it was interrupted before its
+    earlier report was removed.
+    """
+    if not (path / REPORT).is_file():
+        return 0
+    raw = files.load_json(path / REPORT)
+    count = len(raw.get("tasks", ())) if isinstance(raw, dict) else 0
+    # Otherwise the report is damaged, which `read` tells.
+    if count and (path / state.STATE).is_file() and recipes.is_robot_stream_run(path):
+        planned = recipes.load(path / "recipe.yaml", kind=recipes.RobotStreamRecipe).tasks
+        return count if count == len(planned) else 0
+    return max(1, count)
 
 
 def write(run: AnyStreamRun, report: StreamReport) -> None:

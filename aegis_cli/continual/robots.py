@@ -414,13 +414,52 @@ def load_to_act(path: Path) -> RobotStreamRun:
     ]
     views = _views(path / ACTION_EXPERT, saved, len(recipe.tasks))
     run = _assemble(recipe, backbone, shape, scales, views, path)
+    _put_back(run, saved)
+    return run
+
+
+def take_over(run: RobotStreamRun, learned: RobotStreamRecipe) -> None:
+    """Give a run that is at its start what the finished run in its folder has learned.
+
+    Args:
+        learned: the finished run's recipe, with the first of this run's tasks.
+
+    Raises:
+        AegisError: files are missing, damaged or of another backbone, or the finished run's action
+            expert has fewer joints than this run's robots.
+    """
+    path, fingerprint, home = run.out / ACTION_EXPERT, run.fingerprint, None
+    if run.learner.trains == "model":
+        home = run.out / BACKBONE
+        trained = backbones.load(str(home))
+        fingerprint = trained.fingerprint()
+        run.model.backbone.load_state_dict(trained.state_dict())
+    saved = _saved_expert(path, learned, fingerprint, home)
+    shape = _checked_shape(path, saved, run.model.backbone, len(learned.tasks))
+    if shape != run.model.expert.shape:
+        needed, there = run.model.expert.shape, shape
+        raise AegisError(
+            f"robots of {needed.proprio} positions and {needed.actions} actions for the stream in "
+            f"'{run.out}'",
+            f"at most the {there.proprio} positions and {there.actions} actions that its action "
+            "expert was made for",
+            "begin a stream with all tasks in another --out",
+        )
+    _put_back(run, saved)
+
+
+def _put_back(run: RobotStreamRun, saved: artifacts.Artifact) -> None:
+    """Copy a finished run's action expert and low-rank experts into a run at its start.
+
+    Raises:
+        AegisError: the low-rank experts are missing, damaged, or not those of the action expert.
+    """
     with torch.no_grad():
         for name, parameter in own_parameters(run.model.expert).items():
             parameter.copy_(saved.tensors[f"expert.{name}"])
     if run.sites:
         files.attach(run)
-        _check_experts(path, saved)
-    return run
+        _check_experts(run.out, saved)
 
 
 def _saved_expert(

@@ -29,7 +29,7 @@ from aegis_cli.common import devices, launch, locks
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Progress, ignore
 from aegis_cli.common.files import canonical, write_text
-from aegis_cli.continual import files, images, loop, state
+from aegis_cli.continual import files, images, loop, more_tasks, state
 from aegis_cli.continual.report import StreamReport
 from aegis_cli.continual.state import AnyStreamRun
 from aegis_cli.recipes import Recipe, RobotStreamRecipe, StreamRecipe
@@ -46,7 +46,8 @@ def run(
     """Learn the stream with the learner `recipe.train.method`, into the run folder `out`.
 
     Args:
-        resume: continue the run in `out`, if there is one.
+        resume: continue the run in `out`, if there is one; a finished stream of robot tasks also
+            with more tasks after its own.
         overwrite: remove the run in `out`, once everything else has been checked.
 
     Raises:
@@ -67,14 +68,16 @@ def _run(
     overwrite: bool,
     on_event: OnEvent,
 ) -> StreamReport:
-    folder.check(out, recipe, resume, overwrite, read_by(recipe))
-    if files.is_done(out) and not overwrite:
+    adds = more_tasks.check(out, recipe, resume, overwrite, read_by(recipe))
+    if files.is_done(out) and not overwrite and not adds:
         _check_same_recording(out, recipe)
         return files.read(out)
     built = build(recipe, out, on_event)
     devices.warn_of_slow_bf16(built.device, recipe.train.precision, on_event)
     if overwrite:
         folder.remove(out)
+    if adds:
+        more_tasks.begin(built, on_event)
     optimizer = None
     if (out / state.STATE).exists():
         optimizer = state.restore(built)
