@@ -29,6 +29,7 @@ from aegis_cli.cli import (
 )
 from aegis_cli.cli.exits import GOES_ON, LIGHTER, Commands, ended_by
 from aegis_cli.cli.options import (
+    Against,
     AnchorIn,
     Ask,
     BackboneName,
@@ -925,14 +926,7 @@ def compare(
             help="Folders of runs; a job's, or any other with runs in it, stands for all of them.",
         ),
     ],
-    against: Annotated[
-        str | None,
-        Option(
-            metavar="RUN",
-            help="Run that the others are compared with in pairs: its folder or its method; "
-            "default: the first run or, if a folder of several comes first, its naive one.",
-        ),
-    ] = None,
+    against: Against = None,
     wide: Wide = False,
     as_json: Json = False,
 ) -> None:
@@ -1017,6 +1011,7 @@ def report(
             help="Page to write, ending in .html; default: PATH/report.html, and none for several.",
         ),
     ] = None,
+    against: Against = None,
     as_json: Json = False,
 ) -> None:
     """Write all that a folder holds as one HTML page, which needs no other file and no network.
@@ -1029,8 +1024,9 @@ def report(
     \b
     Example: aegis report runs/quickstart
     Example: aegis report runs/x runs/y --out compared.html
+    Example: aegis report runs --against lora
     """
-    reporting.write(paths, out, as_json)
+    reporting.write(paths, out, as_json, against)
 
 
 @app.command(short_help="Let a trained policy act, and count its successes.")

@@ -278,6 +278,15 @@ Wide = Annotated[
         "table that is too wide continues below with its next columns.",
     ),
 ]
+Against = Annotated[
+    str | None,
+    Option(
+        "--against",
+        metavar="RUN",
+        help="Run that the others are compared with in pairs: its folder or its method; default: "
+        "the first run or, if a folder of several comes first, its naive one.",
+    ),
+]
 _RESUMED = "Continue from the last checkpoint in --out; without a run there, start one."
 Resume = Annotated[
     bool,

@@ -12,8 +12,13 @@ from aegis_cli.common.errors import AegisError
 NAME = "report.html"
 
 
-def write(paths: Sequence[Path], out: Path | None, as_json: bool) -> None:
+def write(
+    paths: Sequence[Path], out: Path | None, as_json: bool, against: str | None = None
+) -> None:
     """Write the page of a folder or of several, and print where; with `as_json`, its document too.
+
+    Args:
+        against: the run that the others' paired differences are from, as in `compare.run`.
 
     Raises:
         AegisError: there is nothing to report on, several folders have no `out`, or the page cannot
@@ -33,8 +38,10 @@ def write(paths: Sequence[Path], out: Path | None, as_json: bool) -> None:
     from aegis_cli.reporting import gather
 
     with render.progress() as on_event:
-        several = len(paths) > 1
-        found = gather.of_runs(paths, on_event) if several else gather.run(paths[0], on_event)
+        if len(paths) > 1:
+            found = gather.of_runs(paths, on_event, against)
+        else:
+            found = gather.run(paths[0], on_event, against)
     target = paths[0] / NAME if out is None else out
     page.save(found, target)
     if as_json:

@@ -121,7 +121,7 @@ def run(
     """
     first, *others = (runs_in(Path(given), on_event) for given in paths)
     found = first + [one for several in others for one in several]
-    reference = first_naive(first) if against is None else _named(against, found)
+    reference = first_naive(first) if against is None else named(against, found)
     return of(found, reference, on_event)
 
 
@@ -176,7 +176,7 @@ def of(found: Sequence[Inspected], reference: int, on_event: OnEvent = ignore) -
     return made
 
 
-def _named(against: str, found: Sequence[Inspected]) -> int:
+def named(against: str, found: Sequence[Inspected]) -> int:
     """The number of the run with this folder, or the only one with this method.
 
     Raises:

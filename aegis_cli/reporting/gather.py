@@ -175,17 +175,22 @@ _STUDIES: dict[type, str] = {
 Document = RunDocument | JobDocument | ComparisonDocument | StudyDocument | StreamDocument
 
 
-def run(path: Path, on_event: OnEvent = ignore) -> Document:
+def run(path: Path, on_event: OnEvent = ignore, against: str | None = None) -> Document:
     """The document of a folder.
+
+    Args:
+        against: as in `compare.run`; only for a job, or a folder of runs.
 
     Raises:
         AegisError: the folder was not written by `aegis train` or `aegis run` and has no run in it,
-            or a file is damaged.
+            a file is damaged, or `against` does not fit.
     """
     path = Path(path)
     # A table first: a study that has just started has only cells, which `table.load` reports.
     if (path / table.NAME).is_file() or (path / CELLS).is_file():
-        return _of_table(path)
+        return _of_table(path, against)
+    if (path / "recipe.yaml").is_file():
+        _refuse_against(against, path)
     if recipes.is_stream_run(path):
         found = inspection.run(path)
         assert isinstance(found, inspection.StreamInspection)
@@ -195,7 +200,7 @@ def run(path: Path, on_event: OnEvent = ignore) -> Document:
         return run_document(path, videos=True)
     refuse_unfinished(path, "report")
     if compare.runs_inside(path, ignore):
-        return of_runs([path], on_event)
+        return of_runs([path], on_event, against)
     inside = sorted(p.parent for p in path.glob(f"*/{table.NAME}"))
     inside += sorted(p.parent for p in path.glob("*/recipe.yaml"))
     example = next(iter(inside), "runs/quickstart")
@@ -206,25 +211,41 @@ def run(path: Path, on_event: OnEvent = ignore) -> Document:
     raise AegisError(f"'{path}' is not a run, job or study", expected, fix)
 
 
-def of_runs(paths: Sequence[Path], on_event: OnEvent = ignore) -> ComparisonDocument:
+def _refuse_against(against: str | None, path: Path) -> None:
+    if against is not None:
+        found = f"--against {against} for the page of '{path}', which does not compare runs"
+        expected = "a job, a folder of runs, or several folders"
+        raise AegisError(found, expected, f"{commands.aegis('report', path)} without it")
+
+
+def of_runs(
+    paths: Sequence[Path], on_event: OnEvent = ignore, against: str | None = None
+) -> ComparisonDocument:
     """The document of several runs; one that is named twice is in it once.
 
+    Args:
+        against: as in `compare.run`.
+
     Raises:
-        AegisError: a path is not a run of a policy, nor a folder with such runs, or a file is
-            damaged.
+        AegisError: a path is not a run of a policy, nor a folder with such runs, a file is damaged,
+            or `against` is none of these runs.
     """
     first, *others = (compare.runs_in(Path(given), on_event) for given in paths)
     by_place: dict[Path, compare.Inspected] = {}
     for one in itertools.chain(first, *others):
         by_place.setdefault(one[0].resolve(), one)
     found = list(by_place.values())
-    reference = first[compare.first_naive(first)][0].resolve()
-    comparison = compare.of(found, list(by_place).index(reference), on_event)
+    if against is None:
+        reference = list(by_place).index(first[compare.first_naive(first)][0].resolve())
+    else:
+        reference = compare.named(against, found)
+    comparison = compare.of(found, reference, on_event)
     runs = [run_document(path, videos=True, found=one) for path, one in found]
     labels = zip(runs, _labels(runs), strict=True)
     runs = [dataclasses.replace(one, label=label) for one, label in labels]
     listed = ", ".join(map(str, paths))
-    again = commands.aegis("report", *paths, "--out", "PAGE.html")
+    chosen = () if against is None else ("--against", against)
+    again = commands.aegis("report", *paths, *chosen, "--out", "PAGE.html")
     return ComparisonDocument("comparison", listed, comparison, runs, [again])
 
 
@@ -236,14 +257,16 @@ def _labels(runs: Sequence[RunDocument]) -> list[str]:
     return [one.path for one in runs]
 
 
-def _of_table(path: Path) -> Document:
+def _of_table(path: Path, against: str | None) -> Document:
     found = table.load(path)
     if not isinstance(found, PipelineReport):
+        _refuse_against(against, path)
         again = commands.aegis("run", "RECIPE", "--out", path.parent)
         return StudyDocument(_STUDIES[type(found)], str(path), found, [again])
     inside = [(run, compare.inspected(run)) for run in table.runs(found)]
     runs = [run_document(run, found=one) for run, one in inside]
-    compared = compare.of(inside, compare.first_naive(inside))
+    chosen = compare.first_naive(inside) if against is None else compare.named(against, inside)
+    compared = compare.of(inside, chosen)
     # Each method's recipe names all methods of the job, and has every value that was set.
     recipe = path / found.rows[0].method / "recipe.yaml"
     again = commands.aegis("run", recipe, "--out", "NEW_FOLDER")

@@ -353,9 +353,9 @@ def test_what_an_older_version_did_not_write_is_left_out(aegis, job: Path, missi
 # --- several runs ---------------------------------------------------------------------------------
 
 
-def compared(aegis: Any, *runs: Path) -> tuple[Page, Any]:
+def compared(aegis: Any, *runs: Path | str) -> tuple[Page, Any]:
     """The page of several runs, and the output of `--json` when it was written."""
-    out = runs[0].parent / "compared.html"
+    out = Path(runs[0]).parent / "compared.html"
     code, said, err = aegis("report", *runs, "--out", out, "--json")
     assert code == 0, err
     return Page(out.read_text(encoding="utf-8")), json.loads(said)
@@ -401,6 +401,18 @@ def test_a_folder_of_runs_has_a_page_in_it(aegis, job: Path) -> None:
     check_figures(page, document)
     assert [run["label"] for run in document["runs"]] == ["aegis", "naive"]
     assert document["comparison"]["against"] == str(job.parent / "runs" / "b")
+
+
+def test_a_page_shows_differences_from_the_chosen_run(aegis, job: Path) -> None:
+    for paths in ((job, job / "naive"), (job,)):
+        page, document = compared(aegis, *paths, "--against", "aegis")
+        check_figures(page, document)
+        against = document.get("comparison", document)["against"]
+        assert against == str(job / "aegis") and "Differences from aegis" in page.said
+    said = refused(aegis("report", job, "--against", "lora"))
+    assert "--against lora, which is none of the compared runs" in said
+    said = refused(aegis("report", job / "naive", "--against", "aegis"))
+    assert "which does not compare runs" in said
 
 
 def test_runs_of_one_method_have_their_folders_names(aegis, job: Path) -> None:
