@@ -353,6 +353,8 @@ class DeployedPolicy:
         if not isinstance(instruction, str):
             found = f"an instruction of type {type(instruction).__name__}"
             raise AegisError(found, "a text", f"give one str; {_ORDER}")
+        if not instruction.strip():
+            raise AegisError("a blank instruction", "what the robot should do", _ORDER)
         shown = self._in_order(pictures)
         several = len(self.cameras) > 1
         names = [f" of {name}" for name in self.cameras] if several else [""]

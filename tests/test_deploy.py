@@ -96,6 +96,12 @@ def acted(folder: Path, picture: np.ndarray) -> np.ndarray:
     return np.concatenate([*found, chunk.ravel(), continued.ravel()])
 
 
+@pytest.mark.parametrize("blank", ["", "  \n"])
+def test_a_blank_instruction_is_refused(blank: str) -> None:
+    with pytest.raises(AegisError, match="a blank instruction"):
+        deployed().select_action(frame(), blank, POSITIONS)
+
+
 def test_a_picture_that_nobody_may_write_to_is_taken_as_it_is() -> None:
     """So are those of PIL and of a file; a warning here would be an error."""
     picture = frame()

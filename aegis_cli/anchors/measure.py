@@ -154,10 +154,14 @@ def _warn_of_few(samples: int, settings: Settings, on_event: OnEvent) -> None:
     if samples >= fewest:
         return
     of = "robot frames" if settings.source == "demos" else "questions"
+    more = "Raise --samples (anchor.samples of a recipe), or give more data"
+    if samples < settings.samples:
+        more = "Give more data"
+        if settings.source != "demos":
+            more += ": four of ten questions are for anchors, the others for tuning and probes"
     text = (
         f"measured on {samples:,} {of}, and {', '.join(others or ['moments'])} need at least "
-        f"{fewest} to tell what the backbone knows: methods that read them may protect less. Raise "
-        "--samples (anchor.samples of a recipe), or give more data"
+        f"{fewest} to tell what the backbone knows: methods that read them may protect less. {more}"
     )
     on_event(Warned("anchor", text))
 

@@ -430,6 +430,8 @@ def train(
     as_they_are = _kept_options(ctx, device, as_json)
     advice.of_settings(resolved, overrides or [])
     if not isinstance(resolved, Recipe):
+        if isinstance(resolved, RobotStreamRecipe):
+            advice.of_questions(resolved.backbone, resolved.probe.only_set)
         dry_run_of = stages.DRY_RUN_STREAM if isinstance(resolved, RobotStreamRecipe) else None
         no_dry_run = dry_run and dry_run_of is None
         unused = {"--demos": demos, "--anchor": anchor, "--dry-run": no_dry_run}

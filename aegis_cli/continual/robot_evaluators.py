@@ -11,7 +11,9 @@ from typing import TYPE_CHECKING
 from aegis_cli.common.events import Event, OnEvent, ignore
 from aegis_cli.continual.held_out import HeldOut
 from aegis_cli.data.vqa import sets
+from aegis_cli.data.vqa.knowledge import warn_if_little
 from aegis_cli.data.vqa.metrics import score
+from aegis_cli.data.vqa.questions import majority_share
 from aegis_cli.models.acting import longest_s, play
 from aegis_cli.models.asking import ask
 from aegis_cli.sim.contract import EVALUATION, VALIDATION
@@ -86,6 +88,12 @@ class RobotEvaluator(ABC):
         model, batch_size = self._run.model.backbone.eval(), self._run.recipe.probe.batch_size
         found = score(ask(model, self._asked, batch_size, self.on_event))
         return [found.accuracy, found.cross_entropy]
+
+    def warn_of_little_knowledge(self, accuracy: float) -> None:
+        """Warn if the backbone, of this accuracy before the first task, can hardly lose any."""
+        recipe, majority = self._run.recipe, majority_share(self._asked.questions)
+        asked = recipe.probe.ask
+        warn_if_little(accuracy, majority, recipe.backbone, asked, "train", self.on_event)
 
     def _named(self, task: str) -> OnEvent:
         """A receiver that adds the task's name to events and passes them on."""

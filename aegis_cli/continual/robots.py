@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from aegis_cli import recipes, sim
 from aegis_cli.common import artifacts, commands, devices, gl
 from aegis_cli.common.errors import AegisError, check_finite
-from aegis_cli.common.events import OnEvent, Progress, ignore
+from aegis_cli.common.events import OnEvent, Progress, Warned, ignore
 from aegis_cli.common.state_dicts import check_state, outline, reading_meta, shape_from
 from aegis_cli.continual import files, learners, robot_demos
 from aegis_cli.continual.report import (
@@ -48,6 +48,7 @@ from aegis_cli.data.demonstrations import Demonstrations
 from aegis_cli.data.vqa import sets
 from aegis_cli.models import backbones, policy_meta
 from aegis_cli.models.acting import Acting
+from aegis_cli.models.action_errors import no_better_than_standing_still
 from aegis_cli.models.backbones.base import FLOAT32, Backbone
 from aegis_cli.models.expert import ActionExpert, ExpertShape, check_fit
 from aegis_cli.models.policy import Policy
@@ -211,7 +212,9 @@ class RobotStreamRun(StreamRun[RobotStreamRecipe]):
         return self.evaluator
 
     def before_stream(self) -> None:
-        self.current.vqa.append(self.measuring.vqa())
+        known = self.measuring.vqa()
+        self.current.vqa.append(known)
+        self.measuring.warn_of_little_knowledge(known[0])
 
     def after_task(self) -> dict[str, float]:
         current = self.current
@@ -220,6 +223,7 @@ class RobotStreamRun(StreamRun[RobotStreamRecipe]):
         current.oracle.append(self.measuring.row(current.task))
         if not self.recipe.simulated:
             current.intervals.append(self.measuring.intervals(current.task))
+            self._warn_of_standing_still(current.oracle[-1][-1])
         current.vqa.append(self.measuring.vqa())
         loss = self.validation_loss()
         figures = {"validation loss": loss, "VQA cross-entropy": current.vqa[-1][1]}
@@ -228,6 +232,13 @@ class RobotStreamRun(StreamRun[RobotStreamRecipe]):
         where = f"after task '{self.names[current.task]}'"
         check_finite(figures, where, self.slower(self.parameters()), self.recipe.train.steps)
         return {"validation_loss": loss}
+
+    def _warn_of_standing_still(self, error: float) -> None:
+        """Warn of a task whose actions are predicted no better than by holding the position."""
+        task = self.current.task
+        hold = self.measuring.hold_errors[task]
+        if (text := no_better_than_standing_still(error, hold)) is not None:
+            self.measuring.on_event(Warned(f"task {task + 1} {self.names[task]}", text))
 
     def validation_loss(self, on_event: OnEvent = ignore) -> float:
         """The loss of the task just learned, on held-out episodes."""

@@ -18,7 +18,8 @@ import torch
 from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Warned, ignore
-from aegis_cli.data import demonstrations, joints, renaming
+from aegis_cli.data import demonstrations, joints, other_units, renaming
+from aegis_cli.data.batch import deviations
 from aegis_cli.data.demonstrations import Demonstrations, Member
 from aegis_cli.data.joined_frames import JoinedFrames
 from aegis_cli.data.lerobot import dataset, layout
@@ -103,6 +104,7 @@ def joined(
         return first
     sizes = [(frames.shape[1], frames.shape[2]) for frames in first.frames]  # of each camera
     _warn_of_other_sizes(paths, found, on_event)
+    _warn_of_other_units(paths, found, on_event)
     shown = [first, *(other.fitted(sizes) for other in others)]
     # Frames and episodes are numbered consecutively: each set's numbers start where the previous
     # set ends.
@@ -394,6 +396,27 @@ def _refuse_names(path: Path, known_path: Path, other: joints.Difference) -> Non
         "give demonstrations of the same robot; where these are the same joints in the same order, "
         "give them the same names with --set 'demos.rename={ITS NAME: NAME, ...}'",
     )
+
+
+def _warn_of_other_units(
+    paths: Sequence[Path], found: Sequence[Demonstrations], on_event: OnEvent
+) -> None:
+    """Warn of sets whose actions may be in other units than the first set's."""
+    first, *others = found
+    for path, other in zip(paths[1:], others, strict=True):
+        text = other_units.said(
+            f"the actions in '{path}'",
+            _action_spread(other),
+            _action_spread(first),
+            f"those in '{paths[0]}'",
+        )
+        if text is not None:
+            on_event(Warned("train", f"{text}, and one policy cannot act in both"))
+
+
+def _action_spread(own: Demonstrations) -> list[float]:
+    """Standard deviations [A] of the actions in all episodes that are read."""
+    return deviations(own.tensors["actions"][own.read]).tolist()
 
 
 def _warn_of_other_sizes(

@@ -21,7 +21,7 @@ from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Warned, ignore, loading_told
 from aegis_cli.common.kept_lines import KeptLines
 from aegis_cli.common.kinds import quoted
-from aegis_cli.data import demonstrations, joints, mixture, renaming, spread
+from aegis_cli.data import demonstrations, joints, mixture, other_units, renaming, spread
 from aegis_cli.data.demonstrations import Demonstrations
 from aegis_cli.data.lerobot import layout
 from aegis_cli.data.mixture import Robot
@@ -30,7 +30,14 @@ from aegis_cli.data.selection import Selection
 from aegis_cli.evaluation import results
 from aegis_cli.evaluation.results import CHOSEN, OTHER, UNKNOWN, VALIDATION
 from aegis_cli.models import backbones, download, lerobot_folder
-from aegis_cli.models.action_errors import ActionErrors, interval, mean, predict, training_std
+from aegis_cli.models.action_errors import (
+    ActionErrors,
+    interval,
+    mean,
+    no_better_than_standing_still,
+    predict,
+    training_std,
+)
 from aegis_cli.models.policy import Policy
 from aegis_cli.models.policy_meta import PolicyMeta
 from aegis_cli.training import checkpoint, inputs
@@ -277,18 +284,27 @@ def evaluated(
         seed=seed,
         traces=_traces(policy, meta, shown, chosen, seed, batch_size) if asked.traced else [],
     )
+    _warn_of_other_units(report, on_event)
     _warn_of_standing_still(report, on_event)
     return report
 
 
+def _warn_of_other_units(report: OpenLoopReport, on_event: OnEvent) -> None:
+    """Warn of recorded actions that may be in other units than the policy's."""
+    text = other_units.said(
+        f"the actions recorded in '{report.data}'",
+        [one.constant_rmse for one in report.dimensions],
+        [one.training_std for one in report.dimensions],
+        "those that the policy was trained on",
+    )
+    if text is not None:
+        on_event(Warned(_STAGE, f"{text}, and then the errors mean nothing"))
+
+
 def _warn_of_standing_still(report: OpenLoopReport, on_event: OnEvent) -> None:
     """Warn about a policy that is no closer to the recording than a robot that stays in place."""
-    error, hold = report.relative_error, report.hold_error
-    if error is not None and hold is not None and error >= hold:
-        text = (
-            f"the policy's error of {error:.3f} is not below {hold:.3f}, which the current "
-            "position has if it is repeated: it predicts the motion no better than standing still"
-        )
+    text = no_better_than_standing_still(report.relative_error, report.hold_error)
+    if text is not None:
         on_event(Warned(_STAGE, text))
 
 

@@ -157,6 +157,16 @@ class ActionErrors:
         return interval(relative[self.valid], episode_of)
 
 
+def no_better_than_standing_still(error: float | None, hold: float | None) -> str | None:
+    """A sentence on a policy whose error is not below that of holding the position; else None."""
+    if error is None or hold is None or error < hold:
+        return None
+    return (
+        f"the policy's error of {error:.3f} is not below {hold:.3f}, which the current position "
+        "has if it is repeated: it predicts the motion no better than standing still"
+    )
+
+
 def mean(values: np.ndarray | None, valid: np.ndarray) -> float | None:
     """The mean of the valid entries; None if there are none."""
     return None if values is None or not valid.any() else float(values[valid].mean())

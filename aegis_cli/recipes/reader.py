@@ -74,7 +74,8 @@ def _load(path: Path, overrides: Sequence[str], kinds: Sequence[type], command: 
         problems += override(raw, setting)
     recipe = build(kind, raw, problems)
     # The recipe as a whole can be checked only if every key is right.
-    refuse(problems or list(cross_checks(recipe)), str(path))
+    without_line = f"{path} with its --set" if overrides else None
+    refuse(problems or list(cross_checks(recipe)), str(path), without_line)
     return recipe
 
 

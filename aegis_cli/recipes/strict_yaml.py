@@ -95,11 +95,17 @@ def did_you_mean(word: str, choices: Iterable[str]) -> str | None:
     return next(iter(difflib.get_close_matches(word.lower(), list(choices), n=1, cutoff=0.6)), None)
 
 
-def refuse(problems: Sequence[Problem], source: str) -> None:
-    """Raise one AegisError that names every problem, in the file's order, if there are any."""
+def refuse(problems: Sequence[Problem], source: str, without_line: str | None = None) -> None:
+    """Raise one AegisError that names every problem, in the file's order, if there are any.
+
+    Args:
+        without_line: where a problem without a line may be, if not only in `source`.
+    """
     if len(problems) == 1:
         only = problems[0]
-        place = source if only.line is None else f"{source}, line {only.line}"
+        place = f"{source}, line {only.line}"
+        if only.line is None:
+            place = without_line or source
         raise AegisError(f"{only.found} (in {place})", only.expected, only.fix)
     if problems:
         # Problems without a line, such as those of an override, come first.

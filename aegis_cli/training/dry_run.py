@@ -608,7 +608,7 @@ def _warn_of_preparing(timed: _Timed | None, workers: int | None, on_event: OnEv
         on_event(Warned("dry run", text))
     # On a CPU the step itself does most of this.
     if workers is None and timed.prepare_s > timed.step_s / 2:
-        text = f"preparing a batch takes {prepare_s} of a step's {step_s} s; {splits}"
+        text = f"preparing a batch takes {prepare_s} s, and a step {step_s} s; {splits}"
         on_event(Warned("dry run", text))
 
 

@@ -86,6 +86,8 @@ def load(
     warn_of_outliers(demos, recorded, recipe.train, on_event)
     if method.name == "kfac":
         _warn_of_strong_pull(recipe, on_event)
+    if method.name == "nullspace" and anchor is not None:
+        _warn_of_soft_beyond_the_anchor(anchor, recipe, on_event)
     if anchor is not None and method.needs:
         _warn_of_another_prompt(anchor, recipe, on_event)
         _warn_of_other_cameras(anchor, demos, recorded.cameras, recipe.demos.rename, on_event)
@@ -364,6 +366,20 @@ def _warn_of_strong_pull(recipe: Recipe, on_event: OnEvent) -> None:
         return
     rate = recipe.train.backbone_lr
     if text := kfac.why_strong(recipe.kfac.weight, rate, "--set kfac.weight"):
+        on_event(Warned("train", text))
+
+
+def _warn_of_soft_beyond_the_anchor(path: Path, recipe: Recipe, on_event: OnEvent) -> None:
+    """Warn of a `nullspace.soft` that reaches further than the directions that an anchor stores."""
+    left_out = 1 - artifacts.read_header(path).meta.get("energy", 1)
+    soft = recipe.nullspace.soft
+    # Not for the default of both, whose difference is rounding.
+    if recipe.nullspace.energy is None and soft < 0.99 * left_out:
+        text = (
+            f"nullspace.soft: {soft:g} is less than the share {left_out:.2g} of a map's energy "
+            f"that '{path}' does not store: directions of so little energy stay unprotected. "
+            f"Measure the anchor with --energy {1 - soft / 10:.10g}, or raise nullspace.soft"
+        )
         on_event(Warned("train", text))
 
 

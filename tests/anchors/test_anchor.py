@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 import torch
 from samples.graphs import outputs_kept
+from samples.vqa_files import write_jsonl
 
 from aegis_cli.anchors import anchor_file, measure, moments
 from aegis_cli.common import artifacts
@@ -227,6 +228,17 @@ def test_an_anchor_of_few_samples_is_warned_of(
     measure.run(str(tiny_folder), settings, tmp_path / "a.safetensors", on_event=seen.append)
     said = [event.text for event in seen if isinstance(event, Warned)]
     assert len(said) == bool(warns) and all(warns in text for text in said)
+
+
+def test_where_questions_run_out_more_samples_are_not_advised(
+    tiny_folder: Path, tmp_path: Path
+) -> None:
+    path = write_jsonl(tmp_path, 12)
+    seen: list[Event] = []
+    settings = Settings(samples=24, vqa=str(path))
+    measure.run(str(tiny_folder), settings, tmp_path / "a.safetensors", on_event=seen.append)
+    (said,) = [event.text for event in seen if isinstance(event, Warned)]
+    assert "four of ten questions are for anchors" in said and "--samples" not in said
 
 
 @pytest.mark.parametrize("part", ["curvature", "fisher"])

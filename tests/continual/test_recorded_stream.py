@@ -77,6 +77,14 @@ def test_a_joint_whose_scale_a_glitch_makes_is_warned_of(
     assert any("make most of the spread" in text and "in episode 1;" in text for text in warned)
 
 
+def test_a_stream_says_what_is_said_of_a_policy(real: Make, tmp_path: Path) -> None:
+    told: list[Any] = []
+    train.run(real("sequential", steps=1), tmp_path / "run", on_event=told.append)
+    warned = [event.text for event in told if isinstance(event, Warned)]
+    assert sum("it can hardly lose what it does not know" in text for text in warned) == 1
+    assert sum("no better than standing still" in text for text in warned) == 2  # one per task
+
+
 @pytest.mark.parametrize(("method", "keeps"), [("igsp", True), ("sequential", False)])
 def test_what_serves_a_learned_task_has_the_error_that_it_had(
     method: str, keeps: bool, done: Done

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from samples.lerobot import edit_info, episodes, save
+from samples.own_robots import robot
 from samples.sets import halves, part
 
 from aegis_cli.common.errors import AegisError
@@ -125,6 +126,16 @@ def test_pictures_of_another_size_are_fitted_into_the_first_sets(tmp_path: Path)
     assert torch.equal(both.frames[0][frames + begins], fitted.frames[0][frames])
     warned = [event.text for event in said if isinstance(event, Warned)]
     assert len(warned) == 1 and "32 x 40" in warned[0] and str(large) in warned[0]
+
+
+@pytest.mark.parametrize(("factor", "warned"), [(3.0, False), (57.3, True), (1 / 57.3, True)])
+def test_sets_in_other_units_are_told(factor: float, warned: bool, tmp_path: Path) -> None:
+    degrees = robot(tmp_path / "degrees")
+    other = robot(tmp_path / "other", scale=factor)
+    told: list[Event] = []
+    mixture.load((degrees, other), 0.3, 0, on_event=told.append)
+    said = [event.text for event in told if isinstance(event, Warned)]
+    assert any("may be in other units" in text for text in said) == warned
 
 
 def test_frames_that_stay_in_videos_are_joined(tmp_path: Path) -> None:

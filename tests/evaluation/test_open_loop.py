@@ -194,6 +194,17 @@ def test_a_policy_that_is_no_better_than_standing_still_is_told(error: float, wa
     assert len(seen) == warned
 
 
+@pytest.mark.parametrize(("factor", "warned"), [(1.0, False), (5.0, False), (57.3, True)])
+def test_actions_that_may_be_in_other_units_are_told(factor: float, warned: bool) -> None:
+    found = open_loop.compare(recorded(), EVERY, recorded().chunks(EVERY, CHUNK)[0], SPREAD)
+    own = [dataclasses.replace(d, constant_rmse=d.training_std * factor) for d in found.dimensions]
+    for dimensions in (own, [dataclasses.replace(own[0], training_std=0.0), *own]):
+        seen: list[Event] = []
+        report = dataclasses.replace(found, dimensions=dimensions)
+        open_loop._warn_of_other_units(report, seen.append)
+        assert len(seen) == warned
+
+
 def test_dimensions_without_a_name_have_a_number() -> None:
     assert open_loop.action_names(recorded()) == ["action 0", "action 1"]
     assert open_loop.action_names(recorded(("a", ""))) == ["a", "action 1"]

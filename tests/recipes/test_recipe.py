@@ -439,6 +439,12 @@ def test_a_problem_names_its_line(tmp_path):
     ]
 
 
+def test_a_problem_of_an_override_is_not_said_to_be_in_the_file(tmp_path):
+    assert refusal(tmp_path, "name: x\n", "train.stepz=3").found == (
+        f"unknown key 'train.stepz' (in {tmp_path / 'recipe.yaml'} with its --set)"
+    )
+
+
 def test_a_problem_of_a_studys_variant_names_its_line(tmp_path):
     text = "kind: study\nname: x\ntasks: [reach]\nseeds: [0]\nvariants:\n  naive:\n    set: {}\n"
     with pytest.raises(AegisError) as caught:

@@ -125,6 +125,37 @@ def test_a_training_and_its_dry_run_warn_of_a_pull_that_leaves_nothing_to_learn(
         assert all(word in text for text in found for word in words)
 
 
+def of_energy(anchor: Path, energy: float, path: Path) -> Path:
+    """A copy of an anchor that says to store this share of the energy."""
+    saved = artifacts.load(anchor, "anchor")
+    head = saved.header
+    own = {"seed": head.seed, "inputs": head.inputs, "fingerprint": head.fingerprint}
+    artifacts.save(path, "anchor", saved.tensors, **own, meta=head.meta | {"energy": energy})
+    return path
+
+
+@pytest.mark.parametrize(
+    ("soft", "energy", "method", "said_so"),
+    [
+        (1e-4, None, "nullspace", False),  # the defaults
+        (1e-5, None, "nullspace", True),
+        (1e-5, 0.9, "nullspace", False),
+        (1e-5, None, "naive", False),
+    ],
+)
+def test_directions_that_the_anchor_does_not_store_are_said_to_be_free(
+    soft: float, energy: float | None, method: str, said_so: bool, recipe: Recipe,
+    demos_file: Path, anchor_file: Path, tmp_path: Path,
+) -> None:  # fmt: skip
+    chosen = replace(recipe, nullspace=replace(recipe.nullspace, soft=soft, energy=energy))
+    wanted = replace(chosen, train=replace(chosen.train, steps=1))
+    said: list[Event] = []
+    anchor = of_energy(anchor_file, 0.9999, tmp_path / "anchor.safetensors")
+    train.run(wanted, method, demos_file, anchor, tmp_path / "run", on_event=said.append)
+    found = [e.text for e in said if isinstance(e, Warned) and "does not store" in e.text]
+    assert bool(found) == said_so and all("--energy 0.999999," in text for text in found)
+
+
 @pytest.mark.parametrize("method", sorted(METHODS))
 def test_no_graph_outlives_its_step(method: str, start: Start, tmp_path: Path) -> None:
     made, kept = outputs_kept(lambda: start(method, tmp_path / "run"))

@@ -51,6 +51,21 @@ def test_an_anchor_gradient_of_zero_is_no_step(run: assemble.TrainingRun) -> Non
     assert len(run.ledger) == 0
 
 
+def test_another_methods_penalty_may_be_at_its_minimum(run: assemble.TrainingRun) -> None:
+    """Such as the distance to the weights that the training began with, in its first step."""
+    penalty = run.parts.penalty
+    assert penalty is not None
+
+    def zero(seen: Pass) -> tuple[Tensor, Tensor]:
+        whole, w2 = penalty(seen)
+        return whole * 0, w2
+
+    run.parts = replace(run.parts, penalty=zero)
+    run.method = replace(run.method, needs=frozenset())
+    step(run)
+    assert len(run.ledger) == 1
+
+
 def test_a_replaced_parameter_is_named(run: assemble.TrainingRun) -> None:
     layer = run.policy.backbone.get_submodule("layers.0")
     name, found = next(iter(layer.named_parameters()))

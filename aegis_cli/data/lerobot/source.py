@@ -182,7 +182,7 @@ def _check_length(dataset: Dataset, path: Path, number: int, rows: int) -> None:
     length = dataset.episodes[number].length
     if rows != length:
         raise AegisError(
-            f"{rows} rows of episode {number} in '{path}'",
+            f"{rows} row{'s' * (rows != 1)} of episode {number} in '{path}'",
             f"{length} rows one after the other, as the meta folder says",
             WITHOUT,
         )
@@ -257,7 +257,7 @@ def pixel_digests(source: Source, cameras: Sequence[str]) -> list[str]:
             clips = [episode.clips[camera] for episode in dataset.episodes]
             read = {str(clips[number].file) for number in source.episodes}
             videos = {name: dataset.folder / name for name in sorted(read)}
-            hashes = kept_digests.of_files(videos.values(), dataset.folder, fix=layout.AGAIN)
+            hashes = kept_digests.of_files(videos.values(), dataset.folder, fix=WITHOUT)
             about["videos"] = {name: hashes[path] for name, path in videos.items()}
             about["clips"] = [[str(clip.file), clip.start_s] for clip in clips]
             about["times"] = {name: _digest_of_times(path) for name, path in data.items()}

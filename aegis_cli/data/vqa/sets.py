@@ -348,14 +348,15 @@ def _reader(path: Path, split: str | None) -> Reader:
         )
     if path.is_file() and path.suffix == ".jsonl":
         return jsonl.reader(path)
+    # Whatever its name: an official file is never a list.
+    if path.is_file() and path.suffix == ".json" and jsonl.is_list(path):
+        return jsonl.reader(path)
     # Before other .json files, and before folders with parquet files beside the pair.
     if pairs or (path.is_file() and path.name.endswith(official.SUFFIX)):
         return official.reader(pairs[0] if pairs else path)
     if saved.is_dataset(path):
         return saved.reader(path, split)
     if path.is_file() and path.suffix == ".json":
-        if jsonl.is_list(path):
-            return jsonl.reader(path)
         raise official.misnamed(path)
     raise _unknown(f"question set '{path}'")
 

@@ -227,6 +227,13 @@ def test_a_list_that_is_there_twice_is_refused(
         sets.read(str(path), skip_bad)
 
 
+def test_a_list_may_be_named_as_an_official_file(tmp_path: Path) -> None:
+    write_jsonl(tmp_path, 3)
+    text = json.dumps([row(f"images/{i}.png") for i in range(3)])
+    (tmp_path / "questions.json").write_text(text)
+    assert len(sets.read(str(tmp_path / "questions.json")).entries) == 3
+
+
 # --- packed ---------------------------------------------------------------------------------------
 
 
