@@ -195,6 +195,8 @@ def _view(report: Any, tensors: bool) -> Callable[[Any], RenderableType]:
 
     if isinstance(report, inspection.StreamInspection):
         return render.stream_inspect
+    if isinstance(report, inspection.UnfinishedStream):
+        return render.unfinished_stream
     if report.kind == "questions":
         return render.questions
     return partial(render.inspect, tensors=tensors)
@@ -206,6 +208,9 @@ def _draw(report: Any, path: Path, plot: Path) -> None:
 
     if isinstance(report, inspection.StreamInspection):
         render.routing_plot(report, plot)
+    elif isinstance(report, inspection.UnfinishedStream):
+        fix = f"continue it: {commands.aegis('train', path)}"
+        raise AegisError(f"--plot of '{path}', an unfinished stream", "a finished one", fix)
     elif report.kind == "questions":
         from aegis_cli.data.vqa import summary
 

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from pydantic import TypeAdapter
 from torch import Tensor
 
 from aegis_cli import recipes
@@ -14,10 +15,13 @@ from aegis_cli.common.errors import AegisError
 from aegis_cli.common.state_dicts import check_state, reading_meta
 from aegis_cli.continual import state
 from aegis_cli.continual.report import (
+    ErrorMatrix,
     ImageStreamReport,
     RecordedStreamReport,
+    RobotMatrix,
     RobotStreamReport,
     StreamReport,
+    SuccessMatrix,
     report_from,
 )
 from aegis_cli.continual.state import AnyStreamRun
@@ -91,6 +95,26 @@ def read(path: Path) -> StreamReport:
             "the report as Aegis wrote it",
             "train the stream again",
         ) from error
+
+
+def read_matrix(path: Path) -> RobotMatrix | None:
+    """What an unfinished stream of robot tasks has measured; None if nothing yet.
+
+    Raises:
+        AegisError: the matrix is damaged.
+    """
+    for kind in (SuccessMatrix, ErrorMatrix):
+        if (path / kind.file).is_file():
+            raw = files.load_json(path / kind.file)
+            try:
+                return TypeAdapter(kind).validate_python(raw)
+            except (TypeError, ValueError) as error:
+                raise AegisError(
+                    f"'{path / kind.file}' is damaged: {error}",
+                    "the matrix as Aegis wrote it",
+                    f"continue the stream, which writes it again: {commands.aegis('train', path)}",
+                ) from error
+    return None
 
 
 def bring_back(model: str) -> str:

@@ -25,6 +25,7 @@ from aegis_cli.inspection.report import (
     SiteSpectrum,
     StreamInspection,
     TensorInfo,
+    UnfinishedStream,
     UnknownFolder,
     steps_taken,
 )
@@ -43,6 +44,7 @@ __all__ = [
     "SiteSpectrum",
     "StreamInspection",
     "TensorInfo",
+    "UnfinishedStream",
     "UnknownFolder",
     "is_questions",
     "run",
@@ -53,7 +55,7 @@ __all__ = [
 
 def run(
     path: Path, on_event: OnEvent = ignore, images: bool = False
-) -> InspectReport | StreamInspection | QuestionsReport:
+) -> InspectReport | StreamInspection | UnfinishedStream | QuestionsReport:
     """Recognise `path`: an embedded model's name, an artifact file, a run, a dataset or questions.
 
     Data on the hub is named by its id. Of a LeRobot dataset only the meta folder is downloaded; of
@@ -67,7 +69,7 @@ def run(
 
     Raises:
         AegisError: nothing is there, it is unknown or damaged, it is a run without a ledger yet, or
-            a stream that is not finished.
+            a stream of images that is not finished.
     """
     path = _located(path)
     if is_questions(path):

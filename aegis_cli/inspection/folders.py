@@ -15,6 +15,8 @@ from aegis_cli.common import artifacts, commands, files
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.headers import Header
 from aegis_cli.continual import files as stream_files
+from aegis_cli.continual import state
+from aegis_cli.continual.state import TaskInProgress
 from aegis_cli.data.lerobot import dataset
 from aegis_cli.data.lerobot.summary import dataset_facts, dataset_features
 from aegis_cli.data.vqa import sets
@@ -26,11 +28,12 @@ from aegis_cli.inspection.report import (
     InspectReport,
     StreamInspection,
     TensorInfo,
+    UnfinishedStream,
     UnknownFolder,
 )
 from aegis_cli.models.backbones import model_folder
 from aegis_cli.models.backbones.families import FAMILIES
-from aegis_cli.recipes import Demos, Recipe
+from aegis_cli.recipes import Demos, Recipe, RobotStreamRecipe
 from aegis_cli.training import (
     checkpoint,
     folder,
@@ -45,15 +48,17 @@ from aegis_cli.training.up_to_date import refuse_unfinished
 _TOLD_OF_MERGES = ("method", "strength", "damping", "base", "kept", "validation_loss")
 
 
-def inspect(path: Path) -> InspectReport | StreamInspection:
+def inspect(path: Path) -> InspectReport | StreamInspection | UnfinishedStream:
     """Determine what a folder is.
 
     Raises:
         UnknownFolder: an unknown kind of folder.
-        AegisError: damaged, a run without a ledger yet, or a stream that is not fully learned.
+        AegisError: damaged, a run without a ledger yet, or an unfinished stream of images.
     """
     # The order matters: a run of a stream has a recipe too, and a checkpoint contains the folder of
     # a model.
+    if recipes.is_robot_stream_run(path) and not stream_files.is_done(path):
+        return _unfinished(path)
     if recipes.is_stream_run(path):
         report = stream_files.read(path)
         return StreamInspection(report.kind, str(path), report)
@@ -198,6 +203,23 @@ def _run_folder(path: Path, at: Path | None = None) -> InspectReport:
     by_checkpoint = () if merged else _by_checkpoint(path, settings)
     report = dataclasses.replace(report, by_checkpoint=by_checkpoint)
     return _with_results(report, path, settings)
+
+
+def _unfinished(path: Path) -> UnfinishedStream:
+    """How far a stream of robot tasks is, and what was measured so far."""
+    recipe = recipes.load(path / "recipe.yaml", kind=RobotStreamRecipe)
+    saved = path / state.STATE
+    place = state.place_in(saved) if saved.is_file() else TaskInProgress()
+    return UnfinishedStream(
+        kind="unfinished-stream",
+        path=str(path),
+        method=recipe.train.method,
+        tasks=recipe.tasks,
+        learned=place.task,
+        step=place.step,
+        steps=recipe.train.steps,
+        matrix=stream_files.read_matrix(path) if place.task else None,
+    )
 
 
 def _by_checkpoint(path: Path, settings: Recipe) -> tuple[CheckpointFigures, ...]:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from aegis_cli.common.errors import AegisError
 
 if TYPE_CHECKING:
-    from aegis_cli.continual.report import StreamReport
+    from aegis_cli.continual.report import RobotMatrix, StreamReport
     from aegis_cli.data.lerobot.summary import FeatureInfo
     from aegis_cli.evaluation.results import PlayedResult, Result
 
@@ -174,6 +174,29 @@ def steps_taken(steps: int | None, planned: int | None) -> str:
         return "-"
     left = planned is not None and steps < planned
     return f"{steps:,} of {planned:,}" if left else f"{steps:,}"
+
+
+@dataclass(frozen=True)
+class UnfinishedStream:
+    """A stream of robot tasks that is still being learned, or was interrupted.
+
+    Attributes:
+        tasks: all tasks of the stream, the first `learned` of which are learned.
+        step: steps taken of the next task, as of the last checkpoint, out of `steps`.
+        matrix: what was measured after the tasks so far; None before the first has ended.
+    """
+
+    kind: str
+    path: str
+    method: str
+    tasks: tuple[str, ...]
+    learned: int
+    step: int
+    steps: int
+    matrix: RobotMatrix | None
+
+    def to_json(self) -> dict[str, Any]:
+        return dataclasses.asdict(self)
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from aegis_cli import inspection, recipes, sim
 from aegis_cli.common import artifacts, commands, machine
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, ignore
+from aegis_cli.continual import files as stream_files
 from aegis_cli.evaluation import kept_figures, results
 from aegis_cli.recipes.study_cells import written_out
 from aegis_cli.reporting import compare
@@ -192,10 +193,9 @@ def run(path: Path, on_event: OnEvent = ignore, against: str | None = None) -> D
     if (path / "recipe.yaml").is_file():
         _refuse_against(against, path)
     if recipes.is_stream_run(path):
-        found = inspection.run(path)
-        assert isinstance(found, inspection.StreamInspection)
+        report = stream_files.read(path)
         repeat = commands.aegis("train", path / "recipe.yaml", "--out", "NEW_FOLDER")
-        return StreamDocument(found.kind, str(path), found.report, [repeat])
+        return StreamDocument(report.kind, str(path), report, [repeat])
     if (path / "recipe.yaml").is_file():
         return run_document(path, videos=True)
     refuse_unfinished(path, "report")

@@ -77,6 +77,30 @@ def test_a_joint_whose_scale_a_glitch_makes_is_warned_of(
     assert any("make most of the spread" in text and "in episode 1;" in text for text in warned)
 
 
+def test_an_unfinished_stream_shows_how_far_it_is(
+    aegis: Callable[..., tuple[int, str, str]], real: Make, done: Done, tmp_path: Path
+) -> None:
+    run = tmp_path / "run"
+    begin = partial(train.run, real("sequential"), run)
+    for place in at_each(((f"task 1 {TASKS[0]}", 2), ("stream", 1)), begin):
+        code, out, _ = aegis("inspect", run, "--json")
+        told = json.loads(out)
+        assert code == 0 and told["kind"] == "unfinished-stream" and told["tasks"] == list(TASKS)
+        code, shown, _ = aegis("inspect", run)
+        assert f"continue it: aegis train {run}" in shown
+        if place[0] == "stream":
+            assert told["matrix"]["errors"] == [list(done("sequential")[0].errors[0])]
+            assert "1 of 2 tasks are learned, and 'open-drawer' has taken 0 of" in shown
+            assert "Open-loop error" in shown
+        else:
+            assert (told["learned"], told["step"], told["matrix"]) == (0, 2, None)
+    code, _, err = aegis("inspect", run, "--plot", tmp_path / "x.png")
+    assert code == 2 and "an unfinished stream" in err
+    (run / "error_matrix.json").write_text("{}")
+    code, _, err = aegis("inspect", run)
+    assert code == 2 and "is damaged" in err
+
+
 def test_a_stream_says_what_is_said_of_a_policy(real: Make, tmp_path: Path) -> None:
     told: list[Any] = []
     train.run(real("sequential", steps=1), tmp_path / "run", on_event=told.append)

@@ -14,6 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from aegis_cli.cli.render.layout import fixed, number, percent, plain_table
+from aegis_cli.common import commands
 
 _UNIT = "squared, over the variance of the training's actions"
 
@@ -43,6 +44,18 @@ def stream_inspect(inspection: Any) -> RenderableType:
     if any(record.sites for record in report.records):
         parts.append(routing(report))
     return Group(*parts, Text(_sums(report)))
+
+
+def unfinished_stream(inspection: Any) -> RenderableType:
+    """How far a stream of robot tasks is, and its matrix of the tasks so far."""
+    tasks, learned = inspection.tasks, inspection.learned
+    title = Text(f"{inspection.path}: {inspection.method} on {', '.join(tasks)}", "bold")
+    far = f"unfinished: {learned} of {len(tasks)} tasks are learned"
+    if learned < len(tasks):
+        far += f", and '{tasks[learned]}' has taken {inspection.step} of {inspection.steps} steps"
+    matrix = [] if inspection.matrix is None else _matrix(inspection.matrix)
+    on = f"continue it: {commands.aegis('train', inspection.path)}"
+    return Group(title, Text(far), *matrix, Text(on))
 
 
 def _matrix(report: Any) -> list[RenderableType]:
