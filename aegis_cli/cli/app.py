@@ -936,7 +936,8 @@ def compare(
 
     Shown is what `aegis run`, `aegis probe`, `aegis rollout` and `aegis evaluate` have measured of
     each. A second table has each run's differences from one of them, on the same questions and
-    episodes, with 95 % intervals.
+    episodes, with 95 % intervals. Streams of the same tasks are compared by the figures of their
+    matrices, the VQA that they lost, and the numbers that they store.
 
     \b
     Example: aegis compare runs/x runs/y
@@ -944,6 +945,10 @@ def compare(
     Example: aegis compare runs/quickstart --against lora
     Example: aegis compare runs/quickstart runs/x --json
     """
+    if all(map(is_stream_run, paths)):
+        stages.refuse_options(["--against"] if against is not None else [], f"'{paths[0]}'")
+        stages.COMPARE_STREAMS.run(paths, wide=wide, as_json=as_json)
+        return
     stages.COMPARE.run(paths, against=against, wide=wide, as_json=as_json)
 
 

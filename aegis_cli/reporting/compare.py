@@ -351,8 +351,8 @@ def _runs(path: Path, on_event: OnEvent) -> list[Path]:
     raise AegisError(
         f"'{path}' is not the run of a policy",
         expected,
-        "aegis inspect shows studies and streams; two models are compared by aegis probe MODEL "
-        "--baseline MODEL",
+        "streams are compared with streams, and aegis inspect shows studies; two models are "
+        "compared by aegis probe MODEL --baseline MODEL",
     )
 
 

@@ -101,6 +101,30 @@ def test_an_unfinished_stream_shows_how_far_it_is(
     assert code == 2 and "is damaged" in err
 
 
+def test_streams_are_compared_in_one_table(
+    aegis: Callable[..., tuple[int, str, str]], done: Done, real: Make, tmp_path: Path
+) -> None:
+    (igsp, one), (sequential, other) = done("igsp"), done("sequential")
+    code, out, err = aegis("compare", one, other, "--json")
+    told = json.loads(out)
+    assert code == 0 and told["score"] == "errors" and told["differs"] == [] and not err
+    for row, report in zip(told["rows"], (igsp, sequential), strict=True):
+        figures = report.scores.average, report.scores.last, report.scores.forgetting
+        assert (row["average"], row["last"], row["forgetting"]) == figures
+        assert row["drop_points"] == report.vqa[-1].drop_points
+        assert (row["method"], row["parameters"]) == (report.method, report.parameters)
+    code, out, _ = aegis("compare", one, other)
+    assert code == 0 and "Open-loop errors on pick, open-drawer" in out and "Transfer" not in out
+    refused = aegis("compare", one, other, "--against", one)
+    assert refused[0] == 2 and "leave out --against" in refused[2]
+    train.run(dataclasses.replace(real("sequential", steps=1), tasks=TASKS), tmp_path / "run")
+    shorter = json.loads((tmp_path / "run" / "stream.json").read_text())
+    shorter["tasks"] = ["pick", "wipe"]
+    (tmp_path / "run" / "stream.json").write_text(json.dumps(shorter))
+    refused = aegis("compare", one, tmp_path / "run")
+    assert refused[0] == 2 and "the tasks pick, wipe in" in refused[2]
+
+
 def test_a_stream_says_what_is_said_of_a_policy(real: Make, tmp_path: Path) -> None:
     told: list[Any] = []
     train.run(real("sequential", steps=1), tmp_path / "run", on_event=told.append)

@@ -20,7 +20,13 @@ from aegis_cli.cli.render.output import (
 from aegis_cli.cli.render.plans import plan
 from aegis_cli.cli.render.plots import check_plot, energy_plot, routing_plot
 from aegis_cli.cli.render.progress import progress
-from aegis_cli.cli.render.streams import stream, stream_inspect, stream_probe, unfinished_stream
+from aegis_cli.cli.render.streams import (
+    compared_streams,
+    stream,
+    stream_inspect,
+    stream_probe,
+    unfinished_stream,
+)
 from aegis_cli.cli.render.studies import robot_stream_study, stream_study, study
 from aegis_cli.cli.render.tables import (
     bench,
@@ -40,6 +46,7 @@ from aegis_cli.cli.render.tables import (
 from aegis_cli.cli.render.training_curves import curves_plot
 
 __all__ = [
+    "compared_streams",
     "unfinished_stream",
     "STDOUT",
     "bench",

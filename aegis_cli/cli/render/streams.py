@@ -13,7 +13,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from aegis_cli.cli.render.layout import fixed, number, percent, plain_table
+from aegis_cli.cli.render.layout import Cell, fixed, number, percent, plain_table
 from aegis_cli.common import commands
 
 _UNIT = "squared, over the variance of the training's actions"
@@ -44,6 +44,29 @@ def stream_inspect(inspection: Any) -> RenderableType:
     if any(record.sites for record in report.records):
         parts.append(routing(report))
     return Group(*parts, Text(_sums(report)))
+
+
+def compared_streams(report: Any) -> RenderableType:
+    """A line per stream: the figures of its matrix, VQA, and what it stores."""
+    share = number if report.score == "errors" else percent
+    unit = "" if report.score == "errors" else " %"
+    shown: dict[str, Callable[[Any], Cell]] = {
+        "Run": lambda row: row.run,
+        "Method": lambda row: row.method,
+        f"Transfer{unit}": lambda row: share(row.transfer),
+        f"Average{unit}": lambda row: share(row.average),
+        f"Last{unit}": lambda row: share(row.last),
+        f"Forgetting{' (points)' if unit else ''}": lambda row: share(row.forgetting),
+        "VQA lost (points)": lambda row: fixed(row.drop_points, 2),
+        "Stored numbers": lambda row: f"{row.parameters:,}",
+        "Minutes": lambda row: fixed(row.minutes, 1),
+    }
+    columns = {head: [show(row) for row in report.rows] for head, show in shown.items()}
+    columns = {head: cells for head, cells in columns.items() if set(cells) != {"-"}}
+    lines = list(zip(*columns.values(), strict=True))
+    names = {"accuracy": "Accuracies", "success": "Successes", "errors": "Open-loop errors"}
+    title = f"{names[report.score]} on {', '.join(report.tasks)}"
+    return plain_table(tuple(columns), lines, left=2, title=title)
 
 
 def unfinished_stream(inspection: Any) -> RenderableType:
