@@ -153,7 +153,8 @@ def take(run: AnyStreamRun, training: TaskTraining, step: int, batch: Any) -> fl
     """
     settings, current, optimizer = run.recipe.train, run.current, training.optimizer
     assert optimizer is not None
-    factor = warmup_then_decay(step, settings.steps, settings.warmup, settings.final_lr_share)
+    plan = settings.steps, settings.warmup, settings.final_lr_share, settings.schedule
+    factor = warmup_then_decay(step, *plan)
     for group in optimizer.param_groups:
         group["lr"] = group["peak"] * factor
     optimizer.zero_grad()

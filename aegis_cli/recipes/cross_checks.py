@@ -26,6 +26,7 @@ from aegis_cli.recipes.streams import (
     RobotStreamRecipe,
     RobotTrain,
     StreamRecipe,
+    StreamTrain,
 )
 from aegis_cli.recipes.strict_yaml import Problem, did_you_mean, refuse
 
@@ -37,6 +38,7 @@ def cross_checks(
 ) -> Iterator[Problem]:
     """Problems that no single key shows."""
     if isinstance(recipe, StreamRecipe):
+        yield from _schedule_checks(recipe.train)
         return
     if isinstance(recipe, PretrainRecipe):
         yield from _width_checks("model", recipe.model)
@@ -126,16 +128,20 @@ def _train_checks(train: Train) -> Iterator[Problem]:
     if train.optimizer != "sgd" and "momentum" in changed(train):
         found = f"train.momentum: {train.momentum:g} with train.optimizer: adamw"
         yield Problem(found, "train.optimizer: sgd", "set it, or delete train.momentum")
-    # A final_lr_share of 1 means a constant rate as well.
-    if train.schedule == CONSTANT and changed(train).get("final_lr_share", 1) != 1:
-        found = f"train.final_lr_share: {train.final_lr_share:g} with train.schedule: {CONSTANT}"
-        fix = "delete train.final_lr_share, or set it to 1"
-        yield Problem(found, "train.schedule: cosine or linear, which fall to it", fix)
+    yield from _schedule_checks(train)
     if train.relative_exclude is not None and not train.relative_actions:
         found = f"train.relative_exclude: {', '.join(train.relative_exclude)}"
         fix = "set it, or delete train.relative_exclude"
         yield Problem(found, "train.relative_actions: true beside it", fix)
     yield from _augment_checks(train)
+
+
+def _schedule_checks(train: Train | StreamTrain | RobotTrain) -> Iterator[Problem]:
+    # A final_lr_share of 1 means a constant rate as well.
+    if train.schedule == CONSTANT and changed(train).get("final_lr_share", 1) != 1:
+        found = f"train.final_lr_share: {train.final_lr_share:g} with train.schedule: {CONSTANT}"
+        fix = "delete train.final_lr_share, or set it to 1"
+        yield Problem(found, "train.schedule: cosine or linear, which fall to it", fix)
 
 
 def _augment_checks(train: Train | RobotTrain) -> Iterator[Problem]:
@@ -172,6 +178,7 @@ def _robot_checks(recipe: RobotStreamRecipe) -> Iterator[Problem]:
     yield from _demos_checks(recipe.demos, len(recipe.tasks))
     yield from _task_checks(recipe)
     train = recipe.train
+    yield from _schedule_checks(train)
     yield from _augment_checks(train)
     if train.batch_size < train.accumulate:
         yield Problem(

@@ -27,9 +27,11 @@ from aegis_cli.recipes.keys import (
 from aegis_cli.recipes.policy import (
     AUGMENTATIONS,
     COLOR_SETS,
+    COSINE,
     NORMALIZATIONS,
     PART,
     PRECISIONS,
+    SCHEDULES,
     TASK,
     TASKS,
     Expert,
@@ -79,6 +81,13 @@ class StreamTrain:
     warmup: int = key(
         NOT_NEGATIVE, default=10, doc="Steps over which the learning rates rise to their peaks."
     )
+    schedule: str = key(
+        choice(*SCHEDULES),
+        default=COSINE,
+        later=True,
+        doc="How the learning rates continue after their peaks in each task: down to "
+        "`final_lr_share` along a cosine or a straight line, or constant at the peaks.",
+    )
     weight_decay: float = key(
         NOT_NEGATIVE, default=0.01, doc="AdamW's weight decay; routers and scales have none."
     )
@@ -87,7 +96,7 @@ class StreamTrain:
         UP_TO_ONE,
         default=0.1,
         doc="Share of the peak learning rates to which they fall. The step after a task's last "
-        "would have it; the last is a little above.",
+        "would have it; the last is a little above. `schedule: constant` takes none.",
     )
     label_smoothing: float = key(
         BELOW_ONE, default=0.2, doc="Share of each label that is spread over all classes."
@@ -124,6 +133,13 @@ class RobotTrain:
     warmup: int = key(
         NOT_NEGATIVE, default=40, doc="Steps over which the learning rates rise to their peaks."
     )
+    schedule: str = key(
+        choice(*SCHEDULES),
+        default=COSINE,
+        later=True,
+        doc="How the learning rates continue after their peaks in each task: down to "
+        "`final_lr_share` along a cosine or a straight line, or constant at the peaks.",
+    )
     weight_decay: float = key(
         NOT_NEGATIVE, default=0.01, doc="AdamW's weight decay; routers and scales have none."
     )
@@ -138,7 +154,7 @@ class RobotTrain:
         UP_TO_ONE,
         default=0.1,
         doc="Share of the peak learning rates to which they fall. The step after a task's last "
-        "would have it; the last is a little above.",
+        "would have it; the last is a little above. `schedule: constant` takes none.",
     )
     freeze: str | tuple[str, ...] | None = key(
         PART,
