@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from aegis_cli.common import devices, interrupts, prefetch
+from aegis_cli.common import devices, interrupts
 from aegis_cli.common.errors import check_finite
 from aegis_cli.common.events import OnEvent, Progress
 from aegis_cli.continual import state
@@ -52,6 +53,10 @@ class TaskTraining:
         """The examples of a step."""
         return self.objective.fetch(torch.from_numpy(self.order.rows(step)), step)
 
+    def batches(self, steps: Sequence[int]) -> AbstractContextManager[Iterator[Any]]:
+        """The examples of each of these steps, fetched ahead."""
+        return self.objective.ahead(self.fetch, steps)
+
 
 def learn(
     run: AnyStreamRun,
@@ -75,7 +80,7 @@ def learn(
     started = time.perf_counter()
 
     steps = settings.steps if run.learner.trains != "nothing" else 0
-    ahead = prefetch.ahead(training.fetch, range(current.step, steps))
+    ahead = training.batches(range(current.step, steps))
     stage = f"task {current.task + 1} {training.objective.name}"
     with ahead as batches, interrupts.saved_first(stage, on_event) as signaled:
         if current.step < steps:

@@ -10,7 +10,8 @@ on held-out episodes) and the backbone's answers to questions with no task activ
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, cast
@@ -22,6 +23,7 @@ from aegis_cli import recipes, sim
 from aegis_cli.common import artifacts, commands, devices, gl
 from aegis_cli.common.errors import AegisError, check_finite
 from aegis_cli.common.events import OnEvent, Progress, ignore
+from aegis_cli.common.ranks import ALONE
 from aegis_cli.common.state_dicts import check_state, outline, reading_meta, shape_from
 from aegis_cli.continual import files, learners, robot_demos
 from aegis_cli.continual.report import (
@@ -54,7 +56,8 @@ from aegis_cli.models.policy import Policy
 from aegis_cli.models.policy_meta import PolicyMeta
 from aegis_cli.models.structure import digest
 from aegis_cli.recipes import RobotStreamRecipe, RobotTrain
-from aegis_cli.training import assemble, checkpoint, freezing, loading, train
+from aegis_cli.training import ahead, assemble, checkpoint, freezing, loading, train
+from aegis_cli.training import step as training_step
 from aegis_cli.training.freezing import Still
 
 # Number of evenly spaced training frames on which routers are measured, with constant noise.
@@ -705,11 +708,38 @@ class FlowMatchingLoss:
         self._first_step = number * recipe.train.steps
         self._settings, self._seed = recipe.train, recipe.seed
         self._policy, self._demos = policy, demos
-        self._calibration = self.fetch(spread.rows(self.size, CALIBRATION_FRAMES))
+        self._device = policy.backbone.device
         self.passes = recipe.train.accumulate
-        self.calibration_passes = calibration_passes(recipe.train, len(self._calibration))
+        looked_at = spread.rows(self.size, CALIBRATION_FRAMES)
+        self.calibration_passes = calibration_passes(recipe.train, len(looked_at))
+        # Prepared once, since they are measured many times.
+        self._calibration = self._prepared(self._read(looked_at), self.calibration_passes)
 
     def fetch(self, rows: Tensor, step: int | None = None) -> RobotBatch:
+        return self._prepared(self._read(rows, step), self.passes)
+
+    def ahead(
+        self, fetch: Callable[[int], RobotBatch], steps: Sequence[int]
+    ) -> AbstractContextManager[Iterator[RobotBatch]]:
+        return ahead.batches(fetch, steps, self._device)
+
+    def preparing_s(self, rows: Tensor) -> float:
+        """Seconds in which one thread reads and processes the frames of these rows for step 0."""
+
+        def prepare(part: Tensor) -> None:
+            batch = self._read(part, 0)
+            self._policy.backbone.process(batch.images, batch.instructions)
+
+        return ahead.preparing_s(prepare, rows)
+
+    def _prepared(self, batch: RobotBatch, passes: int) -> RobotBatch:
+        """The batch, for a GPU with the backbone's inputs for each pass, made on the CPU."""
+        if not devices.reading_stalls(self._device):
+            return batch
+        size = len(batch), int((~batch.is_pad).sum())
+        return training_step.with_prepared(batch, size, self._policy.backbone, ALONE, passes)
+
+    def _read(self, rows: Tensor, step: int | None = None) -> RobotBatch:
         settings, frames = self._settings, self._demos.train[rows]
         batch = self._demos.batch(frames, settings.chunk)
         if step is None or settings.augment is None:
@@ -736,7 +766,11 @@ class FlowMatchingLoss:
         # Each pass draws the noise of the whole batch and uses the part for its own frames.
         of = WholeBatch(len(batch), int((~batch.is_pad).sum()), share)
         part = batch if share == WHOLE else batch.rows(share.rows(len(batch)))
-        encoding = self._policy.encode(part.images, part.instructions)
+        if batch.prepared:
+            inputs = batch.prepared[share.index].inputs
+            encoding = self._policy.backbone.encode(inputs.to(self._device))
+        else:  # on a CPU nothing is prepared ahead
+            encoding = self._policy.encode(part.images, part.instructions)
         samples = self._settings.flow_samples
         return self._policy.flow_loss(part, encoding, samples, draws, of=of)
 

@@ -205,6 +205,14 @@ class RobotTrain:
         doc="Number of passes that a step's frames are split into, to save memory (gradient "
         "accumulation).",
     )
+    workers: int | None = key(
+        POSITIVE,
+        default=None,
+        later=True,
+        shapes=False,
+        doc="Threads that read and prepare batches for a GPU, as in a policy's recipe; the trained "
+        "weights are the same. Null: the number of cores minus one, at most 16.",
+    )
 
 
 @section
