@@ -57,4 +57,5 @@ def policy(run: RobotStreamRun, number: int) -> Policy:
     routing.merge(run.model, run.sites, run.learner.router(number))
     sizes = len(found.proprio_scale.mean), len(found.action_scale.mean)
     expert = found.expert.of_robot(*sizes).to(found.backbone.device)
-    return Policy(found.backbone, expert, found.proprio_scale, found.action_scale).eval()
+    scales, relative = (found.proprio_scale, found.action_scale), found.origins.places
+    return Policy(found.backbone, expert, *scales, relative).to(found.backbone.device).eval()

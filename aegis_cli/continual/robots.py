@@ -47,6 +47,8 @@ from aegis_cli.core.routing import Routed
 from aegis_cli.data import augment, spread
 from aegis_cli.data.batch import Normalizer, RobotBatch, Share, WholeBatch
 from aegis_cli.data.demonstrations import Demonstrations
+from aegis_cli.data.relative import Places
+from aegis_cli.data.relative import of_meta as relative_of
 from aegis_cli.data.vqa import sets
 from aegis_cli.models import backbones, policy_meta
 from aegis_cli.models.acting import Acting
@@ -81,8 +83,8 @@ class RobotStreamRun(StreamRun[RobotStreamRecipe]):
 
     Attributes:
         policies: one per task; they share backbone and action expert, and each has its own scales.
-        views: the entries of each task's policy meta that describe its input: `cameras`,
-            `pictures` and `rename`.
+        views: the entries of each task's policy meta that describe its input and output, such as
+            `cameras`, `pictures`, `rename` and `relative`.
         still: the parts of the backbone that the recipe freezes.
         demos: one per task; empty in a run that only acts.
         question_files: digests of the files that the questions come from; empty for scenes.
@@ -332,17 +334,22 @@ def build(recipe: RobotStreamRecipe, out: Path, on_event: OnEvent = ignore) -> R
     _check_freeze(recipe, backbone, on_event)
     loading.check_cameras(backbone, recipe)
     robot_demos.check_given(recipe, on_event)
+    robot_demos.check_relative(recipe)
     for task in recipe.tasks if recipe.simulated else ():
         robot_demos.check_words(backbone, task)
     # Last, after all other checks, because recording takes long.
     numbers = range(len(recipe.tasks))
     demos = tuple(robot_demos.load(recipe, i, backbone, out, on_event) for i in numbers)
-    scales = [d.scales(recipe.train.normalization) for d in demos]
+    joints = [robot_demos.Joints.of(d) for d in demos]
+    places = robot_demos.relative_places(recipe, joints, on_event)
+    fitted = recipe.train.normalization, recipe.train.chunk
+    scales = [d.scales(*fitted, own) for d, own in zip(demos, places, strict=True)]
     # One action expert serves all robots, so it has the sizes of the robot with the most joints.
     proprio = max(len(positions.mean) for positions, _ in scales)
     actions = max(len(of_actions.mean) for _, of_actions in scales)
     shape = assemble.expert_shape(backbone, recipe, proprio, actions)
-    views = [_view(recipe, *each, backbone) for each in zip(demos, scales, strict=True)]
+    each_task = zip(demos, scales, places, strict=True)
+    views = [_view(recipe, *each, backbone) for each in each_task]
     run = _assemble(recipe, backbone, shape, scales, views, out, demos)
     run.model.expert.recomputes = recipe.train.gradient_checkpointing
     run.measure_with(source, on_event)
@@ -473,7 +480,8 @@ def _assemble(
     learner = learners.get(recipe.train.method)
     # Computed from the bare backbone, before experts are added.
     fingerprint, still = backbone.fingerprint(), freezing.named(backbone, recipe.train.freeze)
-    policies = share(backbone, shape, scales, recipe.seed)
+    places = [tuple(view.get("relative", ())) for view in views]
+    policies = share(backbone, shape, scales, recipe.seed, places)
     return RobotStreamRun(
         recipe=recipe,
         learner=learner,
@@ -569,17 +577,24 @@ def _views(path: Path, saved: artifacts.Artifact, tasks: int) -> list[PolicyMeta
             raise ValueError(f"'views' of {len(views)} tasks for {tasks}")
         for i, view in enumerate(views):
             policy_meta.check_view(view)
-            sizes = (len(saved.tensors[f"tasks.{i}.{kind}.mean"]) for kind in ("action", "proprio"))
+            sizes = [len(saved.tensors[f"tasks.{i}.{kind}.mean"]) for kind in ("action", "proprio")]
             policy_meta.check_recorded(view, *sizes)
+            relative_of(view, *sizes)
     return views
 
 
 def _view(
-    recipe: RobotStreamRecipe, shown: Demonstrations, scales: Scales, backbone: Backbone
+    recipe: RobotStreamRecipe,
+    shown: Demonstrations,
+    scales: Scales,
+    places: Places,
+    backbone: Backbone,
 ) -> PolicyMeta:
     """The inputs of a task's policy; for a robot that is not simulated also their meaning."""
     found = assemble.view(shown, backbone)
-    if not assemble.is_spread(scales[1], recipe.train.normalization, shown):
+    if places:
+        found["relative"] = list(places)
+    if places or not assemble.is_spread(scales[1], recipe.train.normalization, shown):
         found["action_std"] = shown.action_std
     reach = shown.proprio_reach(scales[0], recipe.train.normalization)
     if reach is not None:
@@ -637,15 +652,25 @@ def _check_freeze(recipe: RobotStreamRecipe, backbone: Backbone, on_event: OnEve
 
 
 def share(
-    backbone: Backbone, shape: ExpertShape, scales: Sequence[Scales], seed: int
+    backbone: Backbone,
+    shape: ExpertShape,
+    scales: Sequence[Scales],
+    seed: int,
+    places: Sequence[Places],
 ) -> tuple[Policy, ...]:
-    """One policy per task; all share one action expert, initialized from the seed."""
+    """One policy per task; all share one action expert, initialized from the seed.
+
+    Args:
+        places: what each task's actions are relative to; () if all are absolute.
+    """
     # Forked, so that the caller's random state does not change.
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         expert = ActionExpert(shape)
     device = devices.pick()
-    made = [Policy(backbone, expert, *both).to(device).eval() for both in scales]
+    made = []
+    for both, own in zip(scales, places, strict=True):
+        made.append(Policy(backbone, expert, *both, own).to(device).eval())
     return tuple(policy.requires_grad_(False) for policy in made)
 
 

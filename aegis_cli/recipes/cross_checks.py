@@ -129,10 +129,7 @@ def _train_checks(train: Train) -> Iterator[Problem]:
         found = f"train.momentum: {train.momentum:g} with train.optimizer: adamw"
         yield Problem(found, "train.optimizer: sgd", "set it, or delete train.momentum")
     yield from _schedule_checks(train)
-    if train.relative_exclude is not None and not train.relative_actions:
-        found = f"train.relative_exclude: {', '.join(train.relative_exclude)}"
-        fix = "set it, or delete train.relative_exclude"
-        yield Problem(found, "train.relative_actions: true beside it", fix)
+    yield from _relative_checks(train)
     yield from _augment_checks(train)
 
 
@@ -142,6 +139,13 @@ def _schedule_checks(train: Train | StreamTrain | RobotTrain) -> Iterator[Proble
         found = f"train.final_lr_share: {train.final_lr_share:g} with train.schedule: {CONSTANT}"
         fix = "delete train.final_lr_share, or set it to 1"
         yield Problem(found, "train.schedule: cosine or linear, which fall to it", fix)
+
+
+def _relative_checks(train: Train | RobotTrain) -> Iterator[Problem]:
+    if train.relative_exclude is not None and not train.relative_actions:
+        found = f"train.relative_exclude: {', '.join(train.relative_exclude)}"
+        fix = "set it, or delete train.relative_exclude"
+        yield Problem(found, "train.relative_actions: true beside it", fix)
 
 
 def _augment_checks(train: Train | RobotTrain) -> Iterator[Problem]:
@@ -179,6 +183,7 @@ def _robot_checks(recipe: RobotStreamRecipe) -> Iterator[Problem]:
     yield from _task_checks(recipe)
     train = recipe.train
     yield from _schedule_checks(train)
+    yield from _relative_checks(train)
     yield from _augment_checks(train)
     if train.batch_size < train.accumulate:
         yield Problem(

@@ -150,6 +150,19 @@ class RobotTrain:
         doc="How each task's positions and actions are scaled: to mean 0 and standard deviation "
         "1, or by their 1 % and 99 % quantiles.",
     )
+    relative_actions: bool = key(
+        default=False,
+        later=True,
+        doc="Predict each task's actions relative to the robot's position when their chunk begins, "
+        "as in a policy's recipe. The policies add the position again.",
+    )
+    relative_exclude: tuple[str, ...] | None = key(
+        NOT_EMPTY,
+        default=None,
+        later=True,
+        doc="Words in the names of actions that stay absolute under `relative_actions`, such as "
+        "gripper; each is in a name of at least one task.",
+    )
     final_lr_share: float = key(
         UP_TO_ONE,
         default=0.1,
