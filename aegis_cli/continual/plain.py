@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import torch
+
 from aegis_cli import recipes
 from aegis_cli.common import artifacts, commands
 from aegis_cli.common.errors import AegisError
@@ -53,6 +55,8 @@ def policy(run: RobotStreamRun, number: int) -> Policy:
     actions are those of its own robot, even if other tasks of the stream have other robots.
     """
     found = run.policies[number]
+    # Half precision would lose most of what is merged.
+    found.backbone.round_weights(torch.float32)
     # The policies share backbone and expert, so merging into the first policy changes this one too.
     routing.merge(run.model, run.sites, run.learner.router(number))
     sizes = len(found.proprio_scale.mean), len(found.action_scale.mean)

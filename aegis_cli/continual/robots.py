@@ -328,7 +328,7 @@ def build(recipe: RobotStreamRecipe, out: Path, on_event: OnEvent = ignore) -> R
             sim.check_recordable(task)
         else:
             sim.check(task)
-    backbone = backbones.load(recipe.backbone).to(devices.pick()).eval()
+    backbone, fingerprint = _loaded(recipe.backbone, recipe.train.weights)
     if recipe.train.gradient_checkpointing:
         backbone.checkpoint_gradients()
     _check_freeze(recipe, backbone, on_event)
@@ -350,7 +350,7 @@ def build(recipe: RobotStreamRecipe, out: Path, on_event: OnEvent = ignore) -> R
     shape = assemble.expert_shape(backbone, recipe, proprio, actions)
     each_task = zip(demos, scales, places, strict=True)
     views = [_view(recipe, *each, backbone) for each in each_task]
-    run = _assemble(recipe, backbone, shape, scales, views, out, demos)
+    run = _assemble(recipe, backbone, fingerprint, shape, scales, views, out, demos)
     run.model.expert.recomputes = recipe.train.gradient_checkpointing
     run.measure_with(source, on_event)
     return run
@@ -413,17 +413,17 @@ def load_to_act(path: Path) -> RobotStreamRun:
     files.read(path)
     recipe = recipes.load(path / "recipe.yaml", kind=RobotStreamRecipe)
     trains_model = learners.get(recipe.train.method).trains == "model"
-    backbone = backbones.load(str(path / BACKBONE) if trains_model else recipe.backbone)
-    backbone = backbone.to(devices.pick())
     home = path / BACKBONE if trains_model else None
-    saved = _saved_expert(path / ACTION_EXPERT, recipe, backbone.fingerprint(), home)
+    name = recipe.backbone if home is None else str(home)
+    backbone, fingerprint = _loaded(name, recipe.train.weights)
+    saved = _saved_expert(path / ACTION_EXPERT, recipe, fingerprint, home)
     shape = _checked_shape(path / ACTION_EXPERT, saved, backbone, len(recipe.tasks))
     scales = [
         (_scale(saved.tensors, i, "proprio"), _scale(saved.tensors, i, "action"))
         for i in range(len(recipe.tasks))
     ]
     views = _views(path / ACTION_EXPERT, saved, len(recipe.tasks))
-    run = _assemble(recipe, backbone, shape, scales, views, path)
+    run = _assemble(recipe, backbone, fingerprint, shape, scales, views, path)
     with torch.no_grad():
         for name, parameter in own_parameters(run.model.expert).items():
             parameter.copy_(saved.tensors[f"expert.{name}"])
@@ -467,9 +467,25 @@ def _check_experts(path: Path, saved: artifacts.Artifact) -> None:
         )
 
 
+def _loaded(name: str, weights: str) -> tuple[Backbone, str]:
+    """A backbone on its device, with its weights in the dtype of `train.weights`.
+
+    Returns:
+        The backbone, and its fingerprint, which is that of the weights before rounding.
+
+    Raises:
+        AegisError: it cannot be loaded, or has to be float32.
+    """
+    backbone = backbones.load(name)
+    fingerprint = backbone.fingerprint()
+    assemble.round_weights(backbone, weights)
+    return backbone.to(devices.pick()).eval(), fingerprint
+
+
 def _assemble(
     recipe: RobotStreamRecipe,
     backbone: Backbone,
+    fingerprint: str,
     shape: ExpertShape,
     scales: Sequence[Scales],
     views: Sequence[PolicyMeta],
@@ -478,8 +494,7 @@ def _assemble(
 ) -> RobotStreamRun:
     """A run at its start: one policy per task, and sites for experts if its learner has any."""
     learner = learners.get(recipe.train.method)
-    # Computed from the bare backbone, before experts are added.
-    fingerprint, still = backbone.fingerprint(), freezing.named(backbone, recipe.train.freeze)
+    still = freezing.named(backbone, recipe.train.freeze)
     places = [tuple(view.get("relative", ())) for view in views]
     policies = share(backbone, shape, scales, recipe.seed, places)
     return RobotStreamRun(

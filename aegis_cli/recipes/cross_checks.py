@@ -185,6 +185,13 @@ def _robot_checks(recipe: RobotStreamRecipe) -> Iterator[Problem]:
     yield from _schedule_checks(train)
     yield from _relative_checks(train)
     yield from _augment_checks(train)
+    if train.weights != "float32" and train.method == "sequential":
+        yield Problem(
+            f"train.weights: {train.weights} with train.method: sequential, which trains all "
+            "weights",
+            "weights that keep small steps",
+            "set train.weights to float32, or train.method to igsp or isolated-lora",
+        )
     if train.batch_size < train.accumulate:
         yield Problem(
             f"train.batch_size: {train.batch_size} with train.accumulate: {train.accumulate}",

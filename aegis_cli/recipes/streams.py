@@ -34,6 +34,7 @@ from aegis_cli.recipes.policy import (
     SCHEDULES,
     TASK,
     TASKS,
+    WEIGHTS,
     Expert,
     Probe,
 )
@@ -191,6 +192,14 @@ class RobotTrain:
         default="auto",
         doc="Number format of training; auto is bf16 where the hardware multiplies in it, else "
         "float32.",
+    )
+    weights: str = key(
+        choice(*WEIGHTS[:2]),
+        default="float32",
+        later=True,
+        doc="Number format of the weights of a Hugging Face backbone that does not learn; bf16 "
+        "takes half the memory, also when the policies are measured and act. Experts, routers and "
+        "the action expert stay in float32.",
     )
     augment: tuple[str, ...] | None = key(
         choice(*AUGMENTATIONS),
