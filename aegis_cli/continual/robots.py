@@ -169,7 +169,8 @@ class RobotStreamRun(StreamRun[RobotStreamRecipe]):
         policy, name, view = self.policies[task].eval(), self.names[task], self.views[task]
         cameras = checkpoint.cameras_of(view, name)
         sizes = checkpoint.sizes_of(view)
-        return Acting(policy, name, self.recipe.rollout.replan, cameras, sizes=sizes)
+        settings = self.recipe.rollout
+        return Acting(policy, name, settings.replan, cameras, settings.ensemble, sizes)
 
     @property
     def origin(self) -> dict[str, str]:
@@ -190,6 +191,8 @@ class RobotStreamRun(StreamRun[RobotStreamRecipe]):
             "replan": recipe.rollout.replan,
             "normalization": recipe.train.normalization,
         }
+        if recipe.rollout.ensemble is not None:
+            found["ensemble"] = recipe.rollout.ensemble
         chosen = recipes.selected(recipe)
         if "only" in chosen:
             chosen["only"] = chosen["only"][task]

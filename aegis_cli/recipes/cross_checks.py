@@ -53,6 +53,13 @@ def cross_checks(
             "no more actions executed than predicted",
             f"set rollout.replan to at most {recipe.train.chunk}",
         )
+    if recipe.rollout.ensemble is not None and recipe.rollout.replan != 1:
+        yield Problem(
+            f"rollout.ensemble: {recipe.rollout.ensemble:g} with rollout.replan: "
+            f"{recipe.rollout.replan}",
+            "a prediction at every step",
+            "set rollout.replan to 1, or delete rollout.ensemble",
+        )
     # Only for generated questions: from a file, a probe asks at most as many as there are.
     if recipe.probe.questions > MOST_MADE and "scenes" in recipe.probe.sets:
         found = f"probe.questions: {recipe.probe.questions} with probe.vqa: scenes"
@@ -81,13 +88,6 @@ def _policy_checks(recipe: Recipe) -> Iterator[Problem]:
     A key that would have no effect is refused, since a user who sets it expects one. Only keys in
     `changed` count as set.
     """
-    if recipe.rollout.ensemble is not None and recipe.rollout.replan != 1:
-        yield Problem(
-            f"rollout.ensemble: {recipe.rollout.ensemble:g} with rollout.replan: "
-            f"{recipe.rollout.replan}",
-            "a prediction at every step",
-            "set rollout.replan to 1, or delete rollout.ensemble",
-        )
     if recipe.task not in TASKS and "colors" in changed(recipe.rollout):
         found = f"rollout.colors: {', '.join(recipe.rollout.colors)} with task: {recipe.task}"
         yield Problem(found, _NO_COLORS, "delete rollout.colors")
@@ -246,11 +246,15 @@ def _task_checks(recipe: RobotStreamRecipe) -> Iterator[Problem]:
         )
         return
     # Keys that are not read are refused, since a user who sets them expects an effect.
-    read = {"frames", "replan"} if own else {f.name for f in fields(RobotRollout)} - {"frames"}
+    read = (
+        {"ensemble", "frames", "replan"}
+        if own
+        else {f.name for f in fields(RobotRollout)} - {"frames"}
+    )
     for name in sorted(changed(recipe.rollout).keys() - read):
         found = f"rollout.{name}: {getattr(recipe.rollout, name)} with task {recipe.tasks[0]}"
         expected = (
-            "only rollout.frames and rollout.replan: no simulator has this task"
+            "only rollout.ensemble, frames and replan: no simulator has this task"
             if own
             else "no such key: a simulated task is rolled out, without recorded frames"
         )

@@ -331,6 +331,13 @@ class RobotRollout:
     replan: int = key(
         POSITIVE, default=4, doc="Actions that are executed before the next prediction."
     )
+    ensemble: float | None = key(
+        default=None,
+        later=True,
+        doc="Temporal ensembling as in a policy's recipe, which predicts at every step, so that "
+        "`replan` has to be 1. The error at held-out frames has none. Null: chunks are executed as "
+        "they are.",
+    )
     split: str = key(
         choice(*SPLITS),
         default="evaluation",
