@@ -77,7 +77,7 @@ def learn(
     current, settings = run.current, run.recipe.train
     training = prepare(run, prototypes, optimizer)
     loss: float | None = None
-    started = time.perf_counter()
+    started, waited_s = time.perf_counter(), 0.0
 
     steps = settings.steps if run.learner.trains != "nothing" else 0
     ahead = training.batches(range(current.step, steps))
@@ -86,14 +86,17 @@ def learn(
         if current.step < steps:
             on_event(Progress(stage, current.step, steps, "steps"))
         for step in range(current.step, steps):
-            loss = take(run, training, step, next(batches))
+            asked = time.perf_counter()
+            batch = next(batches)
+            waited_s += time.perf_counter() - asked
+            loss = take(run, training, step, batch)
             current.window.append(loss)
             current.step = step + 1
             if current.phase == 1:
                 _watch(run, training)
             if current.step % settings.log_every == 0 or current.step == steps:
-                _log(run, time.perf_counter() - started)
-                started = time.perf_counter()
+                _log(run, time.perf_counter() - started, waited_s)
+                started, waited_s = time.perf_counter(), 0.0
             # After the last step the state is saved only once the task has been evaluated, so a
             # run resumes either before a task's end or after it, never in between.
             if current.step % settings.checkpoint_every == 0 and current.step < steps:
@@ -198,8 +201,12 @@ def take(run: AnyStreamRun, training: TaskTraining, step: int, batch: Any) -> fl
     return figures["loss"]
 
 
-def _log(run: AnyStreamRun, seconds: float) -> None:
-    """Write a line of metrics for the steps since the last line."""
+def _log(run: AnyStreamRun, seconds: float, waited_s: float) -> None:
+    """Write a line of metrics for the steps since the last line.
+
+    Args:
+        waited_s: how much of the seconds they waited for their batches.
+    """
     current = run.current
     line = {
         "task": current.task,
@@ -207,6 +214,7 @@ def _log(run: AnyStreamRun, seconds: float) -> None:
         "phase": current.phase,
         "loss": sum(current.window) / len(current.window),
         "seconds": seconds,
+        "data_s": waited_s,
     }
     folder.append_metrics(run.out, line)
     current.window = []

@@ -119,7 +119,7 @@ def test_a_stream_on_another_device_takes_the_same_steps(
             train.run(recipe, folder / "run")
         else:
             processes.alone(said_there, folder, [command], device, "embedded")
-        told[device] = metrics(folder / "run", ("seconds",))
+        told[device] = metrics(folder / "run", {"seconds", "data_s"})
     assert len(told["cpu"]) == len(told[NAME]) == 2 * (STEPS + 1)
     for own, other in zip(told["cpu"], told[NAME], strict=True):
         assert other == pytest.approx(own, rel=1e-3, abs=1e-6)
@@ -152,6 +152,20 @@ def test_a_run_goes_on_with_another_number_of_threads(real: Make, tmp_path: Path
     found, whole = contents(tmp_path / "run"), contents(tmp_path / "whole")
     assert found.pop("recipe.yaml") != whole.pop("recipe.yaml") and found == whole
     assert recipes.training_part(real("igsp", workers=2)) == recipes.training_part(real("igsp"))
+
+
+def test_the_log_says_how_long_steps_waited(
+    real: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    slow_s = 0.2
+    fetch = slower(robots.FlowMatchingLoss.fetch, slow_s)
+    monkeypatch.setattr(robots.FlowMatchingLoss, "fetch", fetch)
+    train.run(real("isolated-lora", log_every=3), tmp_path / "run")
+    lines = [line for line in metrics(tmp_path / "run") if "loss" in line]
+    assert len(lines) == 2 * STEPS // 3
+    assert all(0 <= line["data_s"] <= line["seconds"] for line in lines)
+    # Nothing can be done while the first batch of a task is fetched.
+    assert all(line["data_s"] > 0.9 * slow_s for line in lines if line["step"] == 3)
 
 
 # --- the dry run ----------------------------------------------------------------------------------
