@@ -503,16 +503,18 @@ def _of_stream(
         # A single picture needs no name.
         cameras = found.cameras if len(found.cameras) > 1 else ()
         known = {"normalization": normalization, "proprio_reach": view.get("proprio_reach")}
+        decay = found.ensemble if ensemble is None else ensemble
         return DeployedPolicy(
-            policy.to(device), found.task, cameras, found.replan, seed, found.sizes, known, ensemble
+            policy.to(device), found.task, cameras, found.replan, seed, found.sizes, known, decay
         )
     run.activate(number)
-    replan = run.recipe.rollout.replan
+    settings = run.recipe.rollout
+    decay = settings.ensemble if ensemble is None else ensemble
     cameras = view.get("cameras", ())
     sizes = checkpoint.sizes_of(view)
     known = {**view, "normalization": normalization}
     return DeployedPolicy(
-        policy.eval().to(device), None, cameras, replan, seed, sizes, known, ensemble
+        policy.eval().to(device), None, cameras, settings.replan, seed, sizes, known, decay
     )
 
 

@@ -17,7 +17,6 @@ from aegis_cli.recipes import (
     RobotStreamStudyRecipe,
     StreamRecipe,
     StreamStudyRecipe,
-    Train,
     options,
     retired,
 )
@@ -112,7 +111,7 @@ def of_settings(
 
 def _of_schedule(recipe: Recipe | StreamRecipe | RobotStreamRecipe) -> Iterator[str]:
     train = recipe.train
-    falls = not (isinstance(train, Train) and train.schedule == CONSTANT)
+    falls = train.schedule != CONSTANT
     if train.warmup > train.steps or (falls and train.warmup == train.steps):
         share = 100 * train.steps / train.warmup  # the warm-up is linear
         lost = ", and they never decay" if falls else ""

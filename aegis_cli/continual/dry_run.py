@@ -25,16 +25,20 @@ from aegis_cli.continual.robots import RobotStreamRun
 from aegis_cli.continual.state import TaskInProgress
 from aegis_cli.core.routing import traced
 from aegis_cli.recipes import RobotStreamRecipe
-from aegis_cli.training import optimizers
+from aegis_cli.training import ahead, optimizers
 from aegis_cli.training.dry_run import (
     MB,
     TIMED_STEPS,
     WRITTEN_COPIES,
     Passing,
+    Timed,
     fits_in,
     free_disk,
     pass_kept,
+    seconds_of,
+    to_time,
     too_little,
+    warn_of_preparing,
     where_it_fits,
 )
 from aegis_cli.training.validation_time import expected_s
@@ -52,8 +56,11 @@ class StreamDryRunReport:
         parameters: parameters of backbone and action expert before the first task.
         steps: steps of each task.
         tasks: by name: `training_frames`, `epochs`, `trainable` (parameters that learn when the
-            task begins) and `step_s` (seconds of a step, interpolated for the tasks between the
-            first and the last; None if memory does not suffice).
+            task begins); `step_s`, `data_s` and `prepare_s` (seconds of a step, of its wait for
+            its batch, and in which one thread reads and processes a batch; interpolated for the
+            tasks between the first and the last; None if memory does not suffice).
+        workers: threads that prepare batches for a GPU; None on a CPU, where the step itself
+            processes what one thread has read.
         tokens_per_frame: tokens of one frame (all cameras) and its instruction, in the task with
             the most.
         memory_mb: estimated memory by component.
@@ -77,6 +84,7 @@ class StreamDryRunReport:
     steps: int
     cameras: list[str]
     tasks: dict[str, dict[str, float | None]]
+    workers: int | None
     tokens_per_frame: int
     memory_mb: dict[str, float]
     memory_total_mb: float
@@ -114,7 +122,14 @@ def run(
             have to record.
     """
     launch.check_one()
-    out, device = Path(out), devices.pick()
+    with prefetch.using(recipe.train.workers):
+        return _run(recipe, Path(out), resume, on_event, overwrite)
+
+
+def _run(
+    recipe: RobotStreamRecipe, out: Path, resume: bool, on_event: OnEvent, overwrite: bool
+) -> StreamDryRunReport:
+    device = devices.pick()
     more_tasks.check(out, recipe, resume, overwrite, train.read_by(recipe))
     recipe = _recorded(recipe, out)
     # Measured before this process allocates any.
@@ -139,6 +154,7 @@ def run(
         needed = memory.peak(device) - base + most.parts["state"]
         fits = fits_in(needed, free, device, ALONE)
         measured = measured._replace(needed=needed)
+        _warn_of_waiting(measured.steps, ahead.workers(device), on_event)
     return _report(stream, parameters, found, most, measured, free, fits, left)
 
 
@@ -214,6 +230,12 @@ class _Begun(NamedTuple):
     training: TaskTraining
     trainable: int
 
+    def preparing_s(self) -> float:
+        """Seconds in which one thread reads and processes a batch."""
+        objective = self.training.objective
+        assert isinstance(objective, robots.FlowMatchingLoss)
+        return objective.preparing_s(torch.from_numpy(self.training.order.rows(0)))
+
     @classmethod
     def at(cls, stream: RobotStreamRun, number: int) -> _Begun:
         """The stream at the beginning of task `number`, after all earlier tasks."""
@@ -274,12 +296,12 @@ class _Measured(NamedTuple):
     """Measured times and memory.
 
     Attributes:
-        step_s: seconds of a step in the first and in the last task.
+        steps: the times of a step in the first and in the last task.
         looks_s: seconds of measuring the routers once; None for a learner without routers.
         needed: peak memory in bytes.
     """
 
-    step_s: tuple[float, float]
+    steps: tuple[Timed, Timed]
     tried_s: list[float]
     vqa_s: float
     loss_s: float
@@ -305,9 +327,7 @@ def _measured(
         The measurements, or None if a later task does not fit by its estimate.
     """
     stream, count = begun.stream, len(begun.stream.names)
-    steps = 2 * (1 + min(TIMED_STEPS, stream.recipe.train.steps))
-    on_event(Progress(_STAGE, 0, steps, "steps"))
-    first_s = last_s = _steps_s(begun, on_event, 0, steps)
+    first = last = _timed(begun, on_event)
     for number in range(1, count):
         begun.ended()
         begun = _Begun.at(stream, number)
@@ -315,7 +335,7 @@ def _measured(
         if fits_in(found[-1].needed, free, stream.device, ALONE) is False:
             return None
     if count > 1:
-        last_s = _steps_s(begun, on_event, steps // 2, steps)
+        last = _timed(begun, on_event)
     looks_s = None
     if stream.sites:
         started = time.perf_counter()
@@ -324,22 +344,35 @@ def _measured(
     evaluator = stream.measuring
     tried_s = [evaluator.tried_s(number) for number in range(count)]
     loss_s = expected_s(stream.validation_loss)
-    return _Measured((first_s, last_s), tried_s, evaluator.vqa_s(), loss_s, looks_s)
+    return _Measured((first, last), tried_s, evaluator.vqa_s(), loss_s, looks_s)
 
 
-def _steps_s(begun: _Begun, on_event: OnEvent, done: int, total: int) -> float:
-    """Seconds of a step: the mean of a few, after a warm-up step."""
+def _warn_of_waiting(steps: tuple[Timed, Timed], workers: int | None, on_event: OnEvent) -> None:
+    """Warn if steps wait for their batches, by the task in which they wait longest."""
+    waited = Timed._fields.index("prepare_s" if workers is None else "data_s")
+    longest = max(steps, key=lambda timed: timed[waited] / timed.step_s)
+    warn_of_preparing(longest, workers, on_event)
+
+
+def _timed(begun: _Begun, on_event: OnEvent) -> Timed:
+    """The times of a step of the first or the last task."""
     stream, training = begun.stream, begun.training
-    steps = range(min(1 + TIMED_STEPS, stream.recipe.train.steps))
-    started = time.perf_counter()
+    steps, first = to_time(TIMED_STEPS, stream.recipe.train.steps, stream.device)
+    # The same number of steps for both of them; a stream of one task has its first one only.
+    last, total = begun.number > 0, len(steps) * min(2, len(stream.names))
+    done = len(steps) if last else 0
+    on_event(Progress(_STAGE, done, total, "steps"))
+    prepare_s = begun.preparing_s()
     stream.model.train()
-    with prefetch.ahead(training.fetch, steps) as batches:
-        for step in steps:
-            if step == 1:
-                started = time.perf_counter()
-            loop.take(stream, training, step, next(batches))
-            on_event(Progress(_STAGE, done + step + 1, total, "steps"))
-    return (time.perf_counter() - started) / max(1, len(steps) - 1)
+
+    def take(step: int, batch: Any) -> None:
+        loop.take(stream, training, step, batch)
+        on_event(Progress(_STAGE, done + step + 1, total, "steps"))
+
+    with training.batches(steps) as batches:
+        # A step of a stream reads its loss, and so has ended when `take` returns.
+        step_s, data_s = seconds_of(steps, first, batches, take, wait=lambda: None)
+    return Timed(step_s, data_s, prepare_s)
 
 
 # --- the report -----------------------------------------------------------------------------------
@@ -356,7 +389,7 @@ def _report(
     left: list[int],
 ) -> StreamDryRunReport:
     recipe, names = stream.recipe, stream.names
-    steps = None if measured is None else _between(measured.step_s, len(names))
+    times = None if measured is None else _between(measured.steps, len(names))
     tasks = {}
     for number, name in enumerate(names):
         frames = len(stream.demos[number].train)
@@ -364,7 +397,7 @@ def _report(
             "training_frames": frames,
             "epochs": recipe.train.steps * recipe.train.batch_size / frames,
             "trainable": found[number].trainable if number < len(found) else None,
-            "step_s": None if steps is None else steps[number],
+            **(dict.fromkeys(Timed._fields) if times is None else times[number]._asdict()),
         }
     disk, disk_free = _disk(stream, max(one.state for one in found)), free_disk(stream.out)
     return StreamDryRunReport(
@@ -376,6 +409,7 @@ def _report(
         steps=recipe.train.steps,
         cameras=list(stream.demos[0].cameras),
         tasks=tasks,
+        workers=ahead.workers(stream.device),
         tokens_per_frame=max(one.tokens for one in found),
         memory_mb={name: size / MB for name, size in most.parts.items()},
         memory_total_mb=most.needed / MB,
@@ -391,10 +425,13 @@ def _report(
     )
 
 
-def _between(ends: tuple[float, float], count: int) -> list[float]:
-    """`count` evenly spaced values from the first to the last of `ends`."""
-    first, last = ends
-    return [first + (last - first) * i / max(1, count - 1) for i in range(count)]
+def _between(ends: tuple[Timed, Timed], count: int) -> list[Timed]:
+    """`count` evenly spaced times from the first to the last of `ends`."""
+    found = []
+    for i in range(count):
+        share = i / max(1, count - 1)
+        found.append(Timed(*(a + (b - a) * share for a, b in zip(*ends, strict=True))))
+    return found
 
 
 def _measuring_s(names: tuple[str, ...], measured: _Measured) -> dict[str, float]:
@@ -407,9 +444,9 @@ def _hours(stream: RobotStreamRun, measured: _Measured, left: list[int]) -> floa
     """Hours of the remaining steps and of the evaluation after their tasks."""
     seconds = measured.vqa_s if left[0] == stream.recipe.train.steps else 0.0  # before the first
     looks_s = (measured.looks_s or 0.0) * _looks(stream)
-    for number, step_s in enumerate(_between(measured.step_s, len(left))):
+    for number, timed in enumerate(_between(measured.steps, len(left))):
         if left[number]:
-            seconds += step_s * left[number] + looks_s
+            seconds += timed.step_s * left[number] + looks_s
             seconds += sum(measured.tried_s[: number + 1]) + measured.vqa_s + measured.loss_s
     return seconds / 3600
 

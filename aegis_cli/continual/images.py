@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -17,7 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from aegis_cli.common import cache, devices
+from aegis_cli.common import cache, devices, prefetch
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Progress, Warned, ignore
 from aegis_cli.common.files import sha256_value
@@ -358,6 +359,11 @@ class ClassificationLoss:
     def fetch(self, rows: Tensor, step: int | None = None) -> tuple[Tensor, Tensor]:
         """Images [B, H, W, 3] uint8 and labels [B]."""
         return self._task.train.images(rows), self._task.train.labels[rows]
+
+    def ahead(
+        self, fetch: Callable[[int], Any], steps: Sequence[int]
+    ) -> AbstractContextManager[Iterator[Any]]:
+        return prefetch.ahead(fetch, steps)
 
     def loss(self, batch: tuple[Tensor, Tensor], step: int, share: Share = WHOLE) -> Tensor:
         return self._loss(batch, self._class_features)

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from aegis_cli.common import devices, interrupts, prefetch
+from aegis_cli.common import devices, interrupts
 from aegis_cli.common.errors import check_finite
 from aegis_cli.common.events import OnEvent, Progress
 from aegis_cli.continual import state
@@ -52,6 +53,10 @@ class TaskTraining:
         """The examples of a step."""
         return self.objective.fetch(torch.from_numpy(self.order.rows(step)), step)
 
+    def batches(self, steps: Sequence[int]) -> AbstractContextManager[Iterator[Any]]:
+        """The examples of each of these steps, fetched ahead."""
+        return self.objective.ahead(self.fetch, steps)
+
 
 def learn(
     run: AnyStreamRun,
@@ -72,23 +77,26 @@ def learn(
     current, settings = run.current, run.recipe.train
     training = prepare(run, prototypes, optimizer)
     loss: float | None = None
-    started = time.perf_counter()
+    started, waited_s = time.perf_counter(), 0.0
 
     steps = settings.steps if run.learner.trains != "nothing" else 0
-    ahead = prefetch.ahead(training.fetch, range(current.step, steps))
+    ahead = training.batches(range(current.step, steps))
     stage = f"task {current.task + 1} {training.objective.name}"
     with ahead as batches, interrupts.saved_first(stage, on_event) as signaled:
         if current.step < steps:
             on_event(Progress(stage, current.step, steps, "steps"))
         for step in range(current.step, steps):
-            loss = take(run, training, step, next(batches))
+            asked = time.perf_counter()
+            batch = next(batches)
+            waited_s += time.perf_counter() - asked
+            loss = take(run, training, step, batch)
             current.window.append(loss)
             current.step = step + 1
             if current.phase == 1:
                 _watch(run, training)
             if current.step % settings.log_every == 0 or current.step == steps:
-                _log(run, time.perf_counter() - started)
-                started = time.perf_counter()
+                _log(run, time.perf_counter() - started, waited_s)
+                started, waited_s = time.perf_counter(), 0.0
             # After the last step the state is saved only once the task has been evaluated, so a
             # run resumes either before a task's end or after it, never in between.
             if current.step % settings.checkpoint_every == 0 and current.step < steps:
@@ -153,7 +161,8 @@ def take(run: AnyStreamRun, training: TaskTraining, step: int, batch: Any) -> fl
     """
     settings, current, optimizer = run.recipe.train, run.current, training.optimizer
     assert optimizer is not None
-    factor = warmup_then_decay(step, settings.steps, settings.warmup, settings.final_lr_share)
+    plan = settings.steps, settings.warmup, settings.final_lr_share, settings.schedule
+    factor = warmup_then_decay(step, *plan)
     for group in optimizer.param_groups:
         group["lr"] = group["peak"] * factor
     optimizer.zero_grad()
@@ -192,8 +201,12 @@ def take(run: AnyStreamRun, training: TaskTraining, step: int, batch: Any) -> fl
     return figures["loss"]
 
 
-def _log(run: AnyStreamRun, seconds: float) -> None:
-    """Write a line of metrics for the steps since the last line."""
+def _log(run: AnyStreamRun, seconds: float, waited_s: float) -> None:
+    """Write a line of metrics for the steps since the last line.
+
+    Args:
+        waited_s: how much of the seconds they waited for their batches.
+    """
     current = run.current
     line = {
         "task": current.task,
@@ -201,6 +214,7 @@ def _log(run: AnyStreamRun, seconds: float) -> None:
         "phase": current.phase,
         "loss": sum(current.window) / len(current.window),
         "seconds": seconds,
+        "data_s": waited_s,
     }
     folder.append_metrics(run.out, line)
     current.window = []

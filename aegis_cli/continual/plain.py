@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import torch
+
 from aegis_cli import recipes
 from aegis_cli.common import artifacts, commands
 from aegis_cli.common.errors import AegisError
@@ -53,8 +55,11 @@ def policy(run: RobotStreamRun, number: int) -> Policy:
     actions are those of its own robot, even if other tasks of the stream have other robots.
     """
     found = run.policies[number]
+    # Half precision would lose most of what is merged.
+    found.backbone.round_weights(torch.float32)
     # The policies share backbone and expert, so merging into the first policy changes this one too.
     routing.merge(run.model, run.sites, run.learner.router(number))
     sizes = len(found.proprio_scale.mean), len(found.action_scale.mean)
     expert = found.expert.of_robot(*sizes).to(found.backbone.device)
-    return Policy(found.backbone, expert, found.proprio_scale, found.action_scale).eval()
+    scales, relative = (found.proprio_scale, found.action_scale), found.origins.places
+    return Policy(found.backbone, expert, *scales, relative).to(found.backbone.device).eval()

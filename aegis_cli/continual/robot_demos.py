@@ -5,8 +5,9 @@ The recipe names them, or they are recorded beside the run.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 
@@ -15,8 +16,9 @@ from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Warned, ignore
 from aegis_cli.common.files import make_folder
 from aegis_cli.common.palette import COLORS
-from aegis_cli.data import demonstrations, mixture, renaming, task_episodes
+from aegis_cli.data import demonstrations, mixture, relative, renaming, task_episodes
 from aegis_cli.data.demonstrations import Demonstrations
+from aegis_cli.data.relative import Places
 from aegis_cli.data.selection import Selection
 from aegis_cli.models.backbones.base import Backbone
 from aegis_cli.recipes import TASK, Demos, RobotStreamRecipe
@@ -51,6 +53,81 @@ def check_given(recipe: RobotStreamRecipe, on_event: OnEvent) -> None:
             _check_task(robot.task, recipe.tasks[number], path)
     if not recipe.simulated:
         _check_own_episodes(recipe, on_event)
+
+
+class Joints(NamedTuple):
+    """The names of a robot's actions and positions, () if they have none, and how many there are.
+
+    Attributes:
+        sizes: of actions and of positions.
+    """
+
+    actions: Sequence[str]
+    positions: Sequence[str]
+    sizes: tuple[int, int]
+
+    def has(self, word: str) -> bool:
+        """Whether an action's name has this word."""
+        return any(word.lower() in name.lower() for name in self.actions)
+
+    @classmethod
+    def of(cls, shown: Demonstrations) -> Joints:
+        """Those of demonstrations."""
+        sizes = shown.tensors["actions"].shape[1], shown.tensors["proprio"].shape[1]
+        return cls(shown.action_names, shown.proprio_names, sizes)
+
+
+def relative_places(
+    recipe: RobotStreamRecipe, joints: Sequence[Joints], on_event: OnEvent = ignore
+) -> list[Places]:
+    """The position that each action of each task is relative to; () if all are absolute.
+
+    Robots may differ: a word of `train.relative_exclude` may be in the names of some tasks only. A
+    warning tells of tasks for which no word excludes anything.
+
+    Raises:
+        AegisError: a word is in no task's names, or `relative.places` raises.
+    """
+    if not recipe.train.relative_actions:
+        return [() for _ in joints]
+    words, found = recipe.train.relative_exclude or (), list[Places]()
+    known = {word for word in words if any(own.has(word) for own in joints)}
+    for task, own in zip(recipe.tasks, joints, strict=True):
+        # Without names it is not known what to exclude, which is refused.
+        lacking = [word for word in words if own.actions and word in known and not own.has(word)]
+        absolute = [word for word in words if word not in lacking]
+        try:
+            found.append(relative.places(own.actions, own.positions, own.sizes, absolute))
+        except AegisError as e:
+            raise AegisError(f"for task '{task}', {e.found}", e.expected, e.fix) from None
+        if lacking and not absolute:
+            text = (
+                f"all actions of '{task}' are relative: none is named {' or '.join(lacking)} "
+                f"(train.relative_exclude), but {', '.join(own.actions)}"
+            )
+            on_event(Warned("train", text))
+    return found
+
+
+def check_relative(recipe: RobotStreamRecipe) -> None:
+    """Raise AegisError unless each action that is to be relative has a position of its name.
+
+    Nothing is decoded or recorded for this.
+    """
+    if recipe.train.relative_actions:
+        tasks = range(len(recipe.tasks))
+        relative_places(recipe, [_joints(recipe, number) for number in tasks])
+
+
+def _joints(recipe: RobotStreamRecipe, number: int) -> Joints:
+    if recipe.demos.paths is None:
+        spec = sim.make(recipe.tasks[number]).spec
+        names = spec.action_names, spec.proprio_names
+        return Joints(*names, (len(names[0]), len(names[1])))
+    robot = mixture.robot_of(*given(recipe, number))
+    positions, actions = robot.sizes
+    names = robot.names.get("action_names", ()), robot.names.get("proprio_names", ())
+    return Joints(*names, (actions, positions))
 
 
 def _check_own_episodes(recipe: RobotStreamRecipe, on_event: OnEvent) -> None:

@@ -10,7 +10,8 @@ on held-out episodes) and the backbone's answers to questions with no task activ
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, cast
@@ -22,6 +23,7 @@ from aegis_cli import recipes, sim
 from aegis_cli.common import artifacts, commands, devices, gl
 from aegis_cli.common.errors import AegisError, check_finite
 from aegis_cli.common.events import OnEvent, Progress, Warned, ignore
+from aegis_cli.common.ranks import ALONE
 from aegis_cli.common.state_dicts import check_state, outline, reading_meta, shape_from
 from aegis_cli.continual import files, learners, robot_demos
 from aegis_cli.continual.report import (
@@ -45,6 +47,8 @@ from aegis_cli.core.routing import Routed
 from aegis_cli.data import augment, spread
 from aegis_cli.data.batch import Normalizer, RobotBatch, Share, WholeBatch
 from aegis_cli.data.demonstrations import Demonstrations
+from aegis_cli.data.relative import Places
+from aegis_cli.data.relative import of_meta as relative_of
 from aegis_cli.data.vqa import sets
 from aegis_cli.models import backbones, policy_meta
 from aegis_cli.models.acting import Acting
@@ -55,7 +59,8 @@ from aegis_cli.models.policy import Policy
 from aegis_cli.models.policy_meta import PolicyMeta
 from aegis_cli.models.structure import digest
 from aegis_cli.recipes import RobotStreamRecipe, RobotTrain
-from aegis_cli.training import assemble, checkpoint, freezing, loading, train
+from aegis_cli.training import ahead, assemble, checkpoint, freezing, loading, train
+from aegis_cli.training import step as training_step
 from aegis_cli.training.freezing import Still
 
 # Number of evenly spaced training frames on which routers are measured, with constant noise.
@@ -79,8 +84,8 @@ class RobotStreamRun(StreamRun[RobotStreamRecipe]):
 
     Attributes:
         policies: one per task; they share backbone and action expert, and each has its own scales.
-        views: the entries of each task's policy meta that describe its input: `cameras`,
-            `pictures` and `rename`.
+        views: the entries of each task's policy meta that describe its input and output, such as
+            `cameras`, `pictures`, `rename` and `relative`.
         still: the parts of the backbone that the recipe freezes.
         demos: one per task; empty in a run that only acts.
         question_files: digests of the files that the questions come from; empty for scenes.
@@ -165,7 +170,8 @@ class RobotStreamRun(StreamRun[RobotStreamRecipe]):
         policy, name, view = self.policies[task].eval(), self.names[task], self.views[task]
         cameras = checkpoint.cameras_of(view, name)
         sizes = checkpoint.sizes_of(view)
-        return Acting(policy, name, self.recipe.rollout.replan, cameras, sizes=sizes)
+        settings = self.recipe.rollout
+        return Acting(policy, name, settings.replan, cameras, settings.ensemble, sizes)
 
     @property
     def origin(self) -> dict[str, str]:
@@ -186,6 +192,8 @@ class RobotStreamRun(StreamRun[RobotStreamRecipe]):
             "replan": recipe.rollout.replan,
             "normalization": recipe.train.normalization,
         }
+        if recipe.rollout.ensemble is not None:
+            found["ensemble"] = recipe.rollout.ensemble
         chosen = recipes.selected(recipe)
         if "only" in chosen:
             chosen["only"] = chosen["only"][task]
@@ -334,24 +342,29 @@ def build(recipe: RobotStreamRecipe, out: Path, on_event: OnEvent = ignore) -> R
             sim.check_recordable(task)
         else:
             sim.check(task)
-    backbone = backbones.load(recipe.backbone).to(devices.pick()).eval()
+    backbone, fingerprint = _loaded(recipe.backbone, recipe.train.weights)
     if recipe.train.gradient_checkpointing:
         backbone.checkpoint_gradients()
     _check_freeze(recipe, backbone, on_event)
     loading.check_cameras(backbone, recipe)
     robot_demos.check_given(recipe, on_event)
+    robot_demos.check_relative(recipe)
     for task in recipe.tasks if recipe.simulated else ():
         robot_demos.check_words(backbone, task)
     # Last, after all other checks, because recording takes long.
     numbers = range(len(recipe.tasks))
     demos = tuple(robot_demos.load(recipe, i, backbone, out, on_event) for i in numbers)
-    scales = [d.scales(recipe.train.normalization) for d in demos]
+    joints = [robot_demos.Joints.of(d) for d in demos]
+    places = robot_demos.relative_places(recipe, joints, on_event)
+    fitted = recipe.train.normalization, recipe.train.chunk
+    scales = [d.scales(*fitted, own) for d, own in zip(demos, places, strict=True)]
     # One action expert serves all robots, so it has the sizes of the robot with the most joints.
     proprio = max(len(positions.mean) for positions, _ in scales)
     actions = max(len(of_actions.mean) for _, of_actions in scales)
     shape = assemble.expert_shape(backbone, recipe, proprio, actions)
-    views = [_view(recipe, *each, backbone) for each in zip(demos, scales, strict=True)]
-    run = _assemble(recipe, backbone, shape, scales, views, out, demos)
+    each_task = zip(demos, scales, places, strict=True)
+    views = [_view(recipe, *each, backbone) for each in each_task]
+    run = _assemble(recipe, backbone, fingerprint, shape, scales, views, out, demos)
     run.model.expert.recomputes = recipe.train.gradient_checkpointing
     run.measure_with(source, on_event)
     return run
@@ -414,17 +427,17 @@ def load_to_act(path: Path) -> RobotStreamRun:
     files.read(path)
     recipe = recipes.load(path / "recipe.yaml", kind=RobotStreamRecipe)
     trains_model = learners.get(recipe.train.method).trains == "model"
-    backbone = backbones.load(str(path / BACKBONE) if trains_model else recipe.backbone)
-    backbone = backbone.to(devices.pick())
     home = path / BACKBONE if trains_model else None
-    saved = _saved_expert(path / ACTION_EXPERT, recipe, backbone.fingerprint(), home)
+    name = recipe.backbone if home is None else str(home)
+    backbone, fingerprint = _loaded(name, recipe.train.weights)
+    saved = _saved_expert(path / ACTION_EXPERT, recipe, fingerprint, home)
     shape = _checked_shape(path / ACTION_EXPERT, saved, backbone, len(recipe.tasks))
     scales = [
         (_scale(saved.tensors, i, "proprio"), _scale(saved.tensors, i, "action"))
         for i in range(len(recipe.tasks))
     ]
     views = _views(path / ACTION_EXPERT, saved, len(recipe.tasks))
-    run = _assemble(recipe, backbone, shape, scales, views, path)
+    run = _assemble(recipe, backbone, fingerprint, shape, scales, views, path)
     _put_back(run, saved)
     return run
 
@@ -507,9 +520,25 @@ def _check_experts(path: Path, saved: artifacts.Artifact) -> None:
         )
 
 
+def _loaded(name: str, weights: str) -> tuple[Backbone, str]:
+    """A backbone on its device, with its weights in the dtype of `train.weights`.
+
+    Returns:
+        The backbone, and its fingerprint, which is that of the weights before rounding.
+
+    Raises:
+        AegisError: it cannot be loaded, or has to be float32.
+    """
+    backbone = backbones.load(name)
+    fingerprint = backbone.fingerprint()
+    assemble.round_weights(backbone, weights)
+    return backbone.to(devices.pick()).eval(), fingerprint
+
+
 def _assemble(
     recipe: RobotStreamRecipe,
     backbone: Backbone,
+    fingerprint: str,
     shape: ExpertShape,
     scales: Sequence[Scales],
     views: Sequence[PolicyMeta],
@@ -518,9 +547,9 @@ def _assemble(
 ) -> RobotStreamRun:
     """A run at its start: one policy per task, and sites for experts if its learner has any."""
     learner = learners.get(recipe.train.method)
-    # Computed from the bare backbone, before experts are added.
-    fingerprint, still = backbone.fingerprint(), freezing.named(backbone, recipe.train.freeze)
-    policies = share(backbone, shape, scales, recipe.seed)
+    still = freezing.named(backbone, recipe.train.freeze)
+    places = [tuple(view.get("relative", ())) for view in views]
+    policies = share(backbone, shape, scales, recipe.seed, places)
     return RobotStreamRun(
         recipe=recipe,
         learner=learner,
@@ -616,17 +645,24 @@ def _views(path: Path, saved: artifacts.Artifact, tasks: int) -> list[PolicyMeta
             raise ValueError(f"'views' of {len(views)} tasks for {tasks}")
         for i, view in enumerate(views):
             policy_meta.check_view(view)
-            sizes = (len(saved.tensors[f"tasks.{i}.{kind}.mean"]) for kind in ("action", "proprio"))
+            sizes = [len(saved.tensors[f"tasks.{i}.{kind}.mean"]) for kind in ("action", "proprio")]
             policy_meta.check_recorded(view, *sizes)
+            relative_of(view, *sizes)
     return views
 
 
 def _view(
-    recipe: RobotStreamRecipe, shown: Demonstrations, scales: Scales, backbone: Backbone
+    recipe: RobotStreamRecipe,
+    shown: Demonstrations,
+    scales: Scales,
+    places: Places,
+    backbone: Backbone,
 ) -> PolicyMeta:
     """The inputs of a task's policy; for a robot that is not simulated also their meaning."""
     found = assemble.view(shown, backbone)
-    if not assemble.is_spread(scales[1], recipe.train.normalization, shown):
+    if places:
+        found["relative"] = list(places)
+    if places or not assemble.is_spread(scales[1], recipe.train.normalization, shown):
         found["action_std"] = shown.action_std
     reach = shown.proprio_reach(scales[0], recipe.train.normalization)
     if reach is not None:
@@ -684,15 +720,25 @@ def _check_freeze(recipe: RobotStreamRecipe, backbone: Backbone, on_event: OnEve
 
 
 def share(
-    backbone: Backbone, shape: ExpertShape, scales: Sequence[Scales], seed: int
+    backbone: Backbone,
+    shape: ExpertShape,
+    scales: Sequence[Scales],
+    seed: int,
+    places: Sequence[Places],
 ) -> tuple[Policy, ...]:
-    """One policy per task; all share one action expert, initialized from the seed."""
+    """One policy per task; all share one action expert, initialized from the seed.
+
+    Args:
+        places: what each task's actions are relative to; () if all are absolute.
+    """
     # Forked, so that the caller's random state does not change.
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         expert = ActionExpert(shape)
     device = devices.pick()
-    made = [Policy(backbone, expert, *both).to(device).eval() for both in scales]
+    made = []
+    for both, own in zip(scales, places, strict=True):
+        made.append(Policy(backbone, expert, *both, own).to(device).eval())
     return tuple(policy.requires_grad_(False) for policy in made)
 
 
@@ -755,11 +801,38 @@ class FlowMatchingLoss:
         self._first_step = number * recipe.train.steps
         self._settings, self._seed = recipe.train, recipe.seed
         self._policy, self._demos = policy, demos
-        self._calibration = self.fetch(spread.rows(self.size, CALIBRATION_FRAMES))
+        self._device = policy.backbone.device
         self.passes = recipe.train.accumulate
-        self.calibration_passes = calibration_passes(recipe.train, len(self._calibration))
+        looked_at = spread.rows(self.size, CALIBRATION_FRAMES)
+        self.calibration_passes = calibration_passes(recipe.train, len(looked_at))
+        # Prepared once, since they are measured many times.
+        self._calibration = self._prepared(self._read(looked_at), self.calibration_passes)
 
     def fetch(self, rows: Tensor, step: int | None = None) -> RobotBatch:
+        return self._prepared(self._read(rows, step), self.passes)
+
+    def ahead(
+        self, fetch: Callable[[int], RobotBatch], steps: Sequence[int]
+    ) -> AbstractContextManager[Iterator[RobotBatch]]:
+        return ahead.batches(fetch, steps, self._device)
+
+    def preparing_s(self, rows: Tensor) -> float:
+        """Seconds in which one thread reads and processes the frames of these rows for step 0."""
+
+        def prepare(part: Tensor) -> None:
+            batch = self._read(part, 0)
+            self._policy.backbone.process(batch.images, batch.instructions)
+
+        return ahead.preparing_s(prepare, rows)
+
+    def _prepared(self, batch: RobotBatch, passes: int) -> RobotBatch:
+        """The batch, for a GPU with the backbone's inputs for each pass, made on the CPU."""
+        if not devices.reading_stalls(self._device):
+            return batch
+        size = len(batch), int((~batch.is_pad).sum())
+        return training_step.with_prepared(batch, size, self._policy.backbone, ALONE, passes)
+
+    def _read(self, rows: Tensor, step: int | None = None) -> RobotBatch:
         settings, frames = self._settings, self._demos.train[rows]
         batch = self._demos.batch(frames, settings.chunk)
         if step is None or settings.augment is None:
@@ -786,7 +859,11 @@ class FlowMatchingLoss:
         # Each pass draws the noise of the whole batch and uses the part for its own frames.
         of = WholeBatch(len(batch), int((~batch.is_pad).sum()), share)
         part = batch if share == WHOLE else batch.rows(share.rows(len(batch)))
-        encoding = self._policy.encode(part.images, part.instructions)
+        if batch.prepared:
+            inputs = batch.prepared[share.index].inputs
+            encoding = self._policy.backbone.encode(inputs.to(self._device))
+        else:  # on a CPU nothing is prepared ahead
+            encoding = self._policy.encode(part.images, part.instructions)
         samples = self._settings.flow_samples
         return self._policy.flow_loss(part, encoding, samples, draws, of=of)
 

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import dataclasses
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Generic, Protocol, TypeVar
@@ -135,6 +136,11 @@ class Objective(Protocol):
             step: the step that trains on them, for which they may be augmented; None means
                 unchanged examples.
         """
+
+    def ahead(
+        self, fetch: Callable[[int], Any], steps: Sequence[int]
+    ) -> AbstractContextManager[Iterator[Any]]:
+        """What `fetch` returns for each of these steps, called ahead of the step."""
 
     def loss(self, batch: Any, step: int, share: Share = WHOLE) -> Tensor:
         """The task's own loss on a batch of `fetch`, with its graph.

@@ -25,7 +25,7 @@ from typing import Any
 import torch
 
 from aegis_cli import recipes
-from aegis_cli.common import devices, launch, locks
+from aegis_cli.common import devices, launch, locks, prefetch
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Progress, ignore
 from aegis_cli.common.files import canonical, write_text
@@ -57,7 +57,8 @@ def run(
     """
     launch.check_one()
     out = Path(out)
-    with locks.alone(out):
+    workers = recipe.train.workers if isinstance(recipe, RobotStreamRecipe) else None
+    with locks.alone(out), prefetch.using(workers):
         return _run(recipe, out, resume, overwrite, on_event)
 
 

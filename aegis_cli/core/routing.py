@@ -33,6 +33,8 @@ from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar
 import torch
 from torch import Tensor, nn
 
+from aegis_cli.core.numerics import wide_type
+
 M = TypeVar("M", bound=nn.Module)
 
 
@@ -61,8 +63,10 @@ class Expert(nn.Module):
     def __init__(self, base: nn.Linear, rank: int, owner: int) -> None:
         super().__init__()
         self.owner, self.frozen = owner, False
-        self.a = nn.Parameter(base.weight.new_zeros(rank, base.in_features))
-        self.b = nn.Parameter(base.weight.new_zeros(base.out_features, rank))
+        # In half precision, small steps would be lost.
+        wide = wide_type(base.weight.dtype)
+        self.a = nn.Parameter(base.weight.new_zeros(rank, base.in_features, dtype=wide))
+        self.b = nn.Parameter(base.weight.new_zeros(base.out_features, rank, dtype=wide))
 
     @torch.no_grad()
     def draw(self, generator: torch.Generator) -> None:
@@ -93,17 +97,17 @@ class Router(nn.Module):
     ) -> None:
         super().__init__()
         self.experts, self.top, self.constant = tuple(experts), top, constant
-        like, count = base.weight, len(experts)
-        self.scale = nn.Parameter(like.new_ones(()))
+        like, count, wide = base.weight, len(experts), wide_type(base.weight.dtype)
+        self.scale = nn.Parameter(like.new_ones((), dtype=wide))
         self.read: nn.Parameter | None = None
         self.bias: nn.Parameter | None = None
         if count == 1:
             return
         if not constant:
             width = rank if top is None else base.in_features  # of a code, or of the map's input
-            self.read = nn.Parameter(like.new_zeros(count, width))
+            self.read = nn.Parameter(like.new_zeros(count, width, dtype=wide))
         if constant or top is None:
-            self.bias = nn.Parameter(like.new_zeros(count))
+            self.bias = nn.Parameter(like.new_zeros(count, dtype=wide))
 
     @torch.no_grad()
     def draw(self, generator: torch.Generator) -> None:
@@ -202,7 +206,9 @@ class RoutedLinear(nn.Module):
         if router is None:
             return y
         experts = self.of(router.experts)
-        rows = torch.cat([e.a for e in experts])  # [E*r, d_in]
+        # Beside a map in half precision, the products are computed in its dtype.
+        dtype = self.base.weight.dtype
+        rows = torch.cat([e.a for e in experts]).to(dtype)  # [E*r, d_in]
         # All experts of a router have the same rank, so one product gives all their codes.
         joined = nn.functional.linear(x, rows)  # [..., E*r]
         codes = joined.unflatten(-1, (len(experts), -1))  # [..., E, r]
@@ -211,7 +217,7 @@ class RoutedLinear(nn.Module):
         # of all experts also computes the sum.
         strengths = (router.scale * weights).unsqueeze(-1)  # s p_e, [..., E, 1]
         mixed = (strengths * codes).flatten(-2)  # [..., E*r]
-        columns = torch.cat([e.b for e in experts], dim=1)  # [d_out, E*r]
+        columns = torch.cat([e.b for e in experts], dim=1).to(dtype)  # [d_out, E*r]
         added_up = torch.addmm(y.flatten(0, -2), mixed.flatten(0, -2), columns.T)
         y = added_up.view_as(y)
         if self.trace is not None:

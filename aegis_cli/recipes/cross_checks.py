@@ -26,6 +26,7 @@ from aegis_cli.recipes.streams import (
     RobotStreamRecipe,
     RobotTrain,
     StreamRecipe,
+    StreamTrain,
 )
 from aegis_cli.recipes.strict_yaml import Problem, did_you_mean, refuse
 
@@ -37,6 +38,7 @@ def cross_checks(
 ) -> Iterator[Problem]:
     """Problems that no single key shows."""
     if isinstance(recipe, StreamRecipe):
+        yield from _schedule_checks(recipe.train)
         return
     if isinstance(recipe, PretrainRecipe):
         yield from _width_checks("model", recipe.model)
@@ -50,6 +52,13 @@ def cross_checks(
             found,
             "no more actions executed than predicted",
             f"set rollout.replan to at most {recipe.train.chunk}",
+        )
+    if recipe.rollout.ensemble is not None and recipe.rollout.replan != 1:
+        yield Problem(
+            f"rollout.ensemble: {recipe.rollout.ensemble:g} with rollout.replan: "
+            f"{recipe.rollout.replan}",
+            "a prediction at every step",
+            "set rollout.replan to 1, or delete rollout.ensemble",
         )
     # Only for generated questions: from a file, a probe asks at most as many as there are.
     if recipe.probe.questions > MOST_MADE and "scenes" in recipe.probe.sets:
@@ -79,13 +88,6 @@ def _policy_checks(recipe: Recipe) -> Iterator[Problem]:
     A key that would have no effect is refused, since a user who sets it expects one. Only keys in
     `changed` count as set.
     """
-    if recipe.rollout.ensemble is not None and recipe.rollout.replan != 1:
-        yield Problem(
-            f"rollout.ensemble: {recipe.rollout.ensemble:g} with rollout.replan: "
-            f"{recipe.rollout.replan}",
-            "a prediction at every step",
-            "set rollout.replan to 1, or delete rollout.ensemble",
-        )
     if recipe.task not in TASKS and "colors" in changed(recipe.rollout):
         found = f"rollout.colors: {', '.join(recipe.rollout.colors)} with task: {recipe.task}"
         yield Problem(found, _NO_COLORS, "delete rollout.colors")
@@ -126,16 +128,24 @@ def _train_checks(train: Train) -> Iterator[Problem]:
     if train.optimizer != "sgd" and "momentum" in changed(train):
         found = f"train.momentum: {train.momentum:g} with train.optimizer: adamw"
         yield Problem(found, "train.optimizer: sgd", "set it, or delete train.momentum")
+    yield from _schedule_checks(train)
+    yield from _relative_checks(train)
+    yield from _augment_checks(train)
+
+
+def _schedule_checks(train: Train | StreamTrain | RobotTrain) -> Iterator[Problem]:
     # A final_lr_share of 1 means a constant rate as well.
     if train.schedule == CONSTANT and changed(train).get("final_lr_share", 1) != 1:
         found = f"train.final_lr_share: {train.final_lr_share:g} with train.schedule: {CONSTANT}"
         fix = "delete train.final_lr_share, or set it to 1"
         yield Problem(found, "train.schedule: cosine or linear, which fall to it", fix)
+
+
+def _relative_checks(train: Train | RobotTrain) -> Iterator[Problem]:
     if train.relative_exclude is not None and not train.relative_actions:
         found = f"train.relative_exclude: {', '.join(train.relative_exclude)}"
         fix = "set it, or delete train.relative_exclude"
         yield Problem(found, "train.relative_actions: true beside it", fix)
-    yield from _augment_checks(train)
 
 
 def _augment_checks(train: Train | RobotTrain) -> Iterator[Problem]:
@@ -172,7 +182,16 @@ def _robot_checks(recipe: RobotStreamRecipe) -> Iterator[Problem]:
     yield from _demos_checks(recipe.demos, len(recipe.tasks))
     yield from _task_checks(recipe)
     train = recipe.train
+    yield from _schedule_checks(train)
+    yield from _relative_checks(train)
     yield from _augment_checks(train)
+    if train.weights != "float32" and train.method == "sequential":
+        yield Problem(
+            f"train.weights: {train.weights} with train.method: sequential, which trains all "
+            "weights",
+            "weights that keep small steps",
+            "set train.weights to float32, or train.method to igsp or isolated-lora",
+        )
     if train.batch_size < train.accumulate:
         yield Problem(
             f"train.batch_size: {train.batch_size} with train.accumulate: {train.accumulate}",
@@ -227,11 +246,15 @@ def _task_checks(recipe: RobotStreamRecipe) -> Iterator[Problem]:
         )
         return
     # Keys that are not read are refused, since a user who sets them expects an effect.
-    read = {"frames", "replan"} if own else {f.name for f in fields(RobotRollout)} - {"frames"}
+    read = (
+        {"ensemble", "frames", "replan"}
+        if own
+        else {f.name for f in fields(RobotRollout)} - {"frames"}
+    )
     for name in sorted(changed(recipe.rollout).keys() - read):
         found = f"rollout.{name}: {getattr(recipe.rollout, name)} with task {recipe.tasks[0]}"
         expected = (
-            "only rollout.frames and rollout.replan: no simulator has this task"
+            "only rollout.ensemble, frames and replan: no simulator has this task"
             if own
             else "no such key: a simulated task is rolled out, without recorded frames"
         )

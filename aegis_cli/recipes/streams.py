@@ -27,11 +27,14 @@ from aegis_cli.recipes.keys import (
 from aegis_cli.recipes.policy import (
     AUGMENTATIONS,
     COLOR_SETS,
+    COSINE,
     NORMALIZATIONS,
     PART,
     PRECISIONS,
+    SCHEDULES,
     TASK,
     TASKS,
+    WEIGHTS,
     Expert,
     Probe,
 )
@@ -79,6 +82,13 @@ class StreamTrain:
     warmup: int = key(
         NOT_NEGATIVE, default=10, doc="Steps over which the learning rates rise to their peaks."
     )
+    schedule: str = key(
+        choice(*SCHEDULES),
+        default=COSINE,
+        later=True,
+        doc="How the learning rates continue after their peaks in each task: down to "
+        "`final_lr_share` along a cosine or a straight line, or constant at the peaks.",
+    )
     weight_decay: float = key(
         NOT_NEGATIVE, default=0.01, doc="AdamW's weight decay; routers and scales have none."
     )
@@ -87,7 +97,7 @@ class StreamTrain:
         UP_TO_ONE,
         default=0.1,
         doc="Share of the peak learning rates to which they fall. The step after a task's last "
-        "would have it; the last is a little above.",
+        "would have it; the last is a little above. `schedule: constant` takes none.",
     )
     label_smoothing: float = key(
         BELOW_ONE, default=0.2, doc="Share of each label that is spread over all classes."
@@ -124,6 +134,13 @@ class RobotTrain:
     warmup: int = key(
         NOT_NEGATIVE, default=40, doc="Steps over which the learning rates rise to their peaks."
     )
+    schedule: str = key(
+        choice(*SCHEDULES),
+        default=COSINE,
+        later=True,
+        doc="How the learning rates continue after their peaks in each task: down to "
+        "`final_lr_share` along a cosine or a straight line, or constant at the peaks.",
+    )
     weight_decay: float = key(
         NOT_NEGATIVE, default=0.01, doc="AdamW's weight decay; routers and scales have none."
     )
@@ -134,11 +151,24 @@ class RobotTrain:
         doc="How each task's positions and actions are scaled: to mean 0 and standard deviation "
         "1, or by their 1 % and 99 % quantiles.",
     )
+    relative_actions: bool = key(
+        default=False,
+        later=True,
+        doc="Predict each task's actions relative to the robot's position when their chunk begins, "
+        "as in a policy's recipe. The policies add the position again.",
+    )
+    relative_exclude: tuple[str, ...] | None = key(
+        NOT_EMPTY,
+        default=None,
+        later=True,
+        doc="Words in the names of actions that stay absolute under `relative_actions`, such as "
+        "gripper; each is in a name of at least one task.",
+    )
     final_lr_share: float = key(
         UP_TO_ONE,
         default=0.1,
         doc="Share of the peak learning rates to which they fall. The step after a task's last "
-        "would have it; the last is a little above.",
+        "would have it; the last is a little above. `schedule: constant` takes none.",
     )
     freeze: str | tuple[str, ...] | None = key(
         PART,
@@ -162,6 +192,14 @@ class RobotTrain:
         default="auto",
         doc="Number format of training; auto is bf16 where the hardware multiplies in it, else "
         "float32.",
+    )
+    weights: str = key(
+        choice(*WEIGHTS[:2]),
+        default="float32",
+        later=True,
+        doc="Number format of the weights of a Hugging Face backbone that does not learn; bf16 "
+        "takes half the memory, also when the policies are measured and act. Experts, routers and "
+        "the action expert stay in float32.",
     )
     augment: tuple[str, ...] | None = key(
         choice(*AUGMENTATIONS),
@@ -188,6 +226,14 @@ class RobotTrain:
         later=True,
         doc="Number of passes that a step's frames are split into, to save memory (gradient "
         "accumulation).",
+    )
+    workers: int | None = key(
+        POSITIVE,
+        default=None,
+        later=True,
+        shapes=False,
+        doc="Threads that read and prepare batches for a GPU, as in a policy's recipe; the trained "
+        "weights are the same. Null: the number of cores minus one, at most 16.",
     )
 
 
@@ -284,6 +330,13 @@ class RobotRollout:
     )
     replan: int = key(
         POSITIVE, default=4, doc="Actions that are executed before the next prediction."
+    )
+    ensemble: float | None = key(
+        default=None,
+        later=True,
+        doc="Temporal ensembling as in a policy's recipe, which predicts at every step, so that "
+        "`replan` has to be 1. The error at held-out frames has none. Null: chunks are executed as "
+        "they are.",
     )
     split: str = key(
         choice(*SPLITS),

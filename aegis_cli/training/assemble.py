@@ -376,16 +376,25 @@ def _fit(backbone: Backbone, recipe: Recipe) -> None:
             "one of the two",
             "--set train.compile=false",
         )
-    if recipe.train.weights != "float32" and not backbone.rounds:
+    round_weights(backbone, recipe.train.weights)
+    if recipe.train.gradient_checkpointing:
+        backbone.checkpoint_gradients()
+
+
+def round_weights(backbone: Backbone, weights: str) -> None:
+    """Round the backbone's weights if `train.weights` is bf16.
+
+    Raises:
+        AegisError: the backbone has to be float32.
+    """
+    if weights != "float32" and not backbone.rounds:
         raise AegisError(
-            f"train.weights: {recipe.train.weights} with the embedded backbone",
+            f"train.weights: {weights} with the embedded backbone",
             "a Hugging Face backbone",
             "--set train.weights=float32",
         )
-    if recipe.train.weights == "bf16":
+    if weights == "bf16":
         backbone.round_weights(torch.bfloat16)
-    if recipe.train.gradient_checkpointing:
-        backbone.checkpoint_gradients()
 
 
 def _check_weights(recipe: Recipe, parts: Parts) -> None:

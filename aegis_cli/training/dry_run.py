@@ -7,7 +7,7 @@ import gc
 import os
 import shutil
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import partial
@@ -23,6 +23,7 @@ from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Progress, Warned, ignore, loading_told
 from aegis_cli.common.ranks import Ranks, joined, rows_here
 from aegis_cli.data import mixture
+from aegis_cli.data.batch import RobotBatch
 from aegis_cli.data.demonstrations import Demonstrations
 from aegis_cli.data.selection import Paths
 from aegis_cli.models import structure
@@ -30,6 +31,7 @@ from aegis_cli.models.buffers import WrittenBuffers
 from aegis_cli.models.policy import Policy
 from aegis_cli.recipes import Recipe, RobotTrain, Train
 from aegis_cli.training import (
+    ahead,
     assemble,
     checkpoint,
     inputs,
@@ -209,7 +211,7 @@ def _planned(
     # Last of all: the steps fill the optimizer state and change the weights.
     needs = _needs(training, parts, free, base, ranks, told)
     train.warn_of_written(training.policy.backbone, buffers, told)
-    _warn_of_preparing(needs.timed, _workers(device), told)
+    warn_of_preparing(needs.timed, ahead.workers(device), told)
     return _report(training, tokens, needs, free, disk, _done(written))
 
 
@@ -250,7 +252,7 @@ def _report(
         step_s=step_s,
         data_s=data_s,
         prepare_s=prepare_s,
-        workers=_workers(policy.backbone.device),
+        workers=ahead.workers(policy.backbone.device),
         validation_s=needs.validation_s,
         hours=_hours(recipe.train, needs, done),
         checkpoints=disk.checkpoints,
@@ -291,7 +293,7 @@ def _sets(training: TrainingRun) -> dict[str, dict[str, float]] | None:
     return found or None
 
 
-class _Timed(NamedTuple):
+class Timed(NamedTuple):
     """Seconds: of a step, of which it waits for its batch, and of a thread per batch."""
 
     step_s: float
@@ -315,7 +317,7 @@ class _Needs(NamedTuple):
     measured: int | None
     together: int | None
     fits: bool | None
-    timed: _Timed | None
+    timed: Timed | None
     validation_s: dict[str, float] | None
 
 
@@ -585,12 +587,7 @@ def where_it_fits(found: Callable[[], T], ranks: Ranks) -> T | None:
         return None
 
 
-def _workers(device: torch.device) -> int | None:
-    """Threads that prepare batches; None on a CPU."""
-    return prefetch.workers() if devices.reading_stalls(device) else None
-
-
-def _warn_of_preparing(timed: _Timed | None, workers: int | None, on_event: OnEvent) -> None:
+def warn_of_preparing(timed: Timed | None, workers: int | None, on_event: OnEvent) -> None:
     """Warn if steps wait for their batches to be prepared."""
     if timed is None:
         return
@@ -612,37 +609,70 @@ def _warn_of_preparing(timed: _Timed | None, workers: int | None, on_event: OnEv
         on_event(Warned("dry run", text))
 
 
-def _timed(training: TrainingRun, on_event: OnEvent) -> _Timed:
+def _timed(training: TrainingRun, on_event: OnEvent) -> Timed:
     """The times of a step, measured on the training's first steps; nothing is written.
 
     Raises:
         Diverged: a step at which the training would end, too.
     """
     settings, parts = training.recipe.train, training.parts
-    # The first step includes one-time work, and batches are fetched meanwhile: those that a GPU
-    # finds ready do not show how long they took, and the next ones may arrive in a burst as large.
-    ready = train.fetched_ahead(training)
-    timed = max(TIMED_STEPS, parts.every, parts.refresh, ready)
-    ahead = 1 + ready
-    steps = range(min(ahead + timed, settings.steps))
-    first = steps[ahead : ahead + 1] or steps  # the first that is timed
-    window, started_s, data_s = train.Window(), 0.0, 0.0
+    least = max(TIMED_STEPS, parts.every, parts.refresh)
+    steps, first = to_time(least, settings.steps, training.policy.backbone.device)
+    window = train.Window()
     training.policy.train()
     on_event(Progress("dry run", 0, len(steps), "steps"))
     prepare_s = train.preparing_s(training)
+
+    def take(index: int, batch: RobotBatch) -> None:
+        train.update(training, index, batch, window)
+        on_event(Progress("dry run", index + 1, len(steps), "steps"))
+
+    def wait() -> None:
+        train.read_figures(training, window)  # waits until the GPU has finished
+
     with train.batches_of(training, steps) as batches:
-        for index in steps:
-            if index == first[0]:
-                train.read_figures(training, window)  # waits until the GPU has finished
-                started_s, data_s = time.perf_counter(), 0.0
-            asked_s = time.perf_counter()
-            batch = next(batches)
-            data_s += time.perf_counter() - asked_s
-            train.update(training, index, batch, window)
-            on_event(Progress("dry run", index + 1, len(steps), "steps"))
-        train.read_figures(training, window)
-    seconds, count = time.perf_counter() - started_s, len(steps) - first[0]
-    return _Timed(seconds / count, data_s / count, prepare_s)
+        step_s, data_s = seconds_of(steps, first, batches, take, wait)
+    return Timed(step_s, data_s, prepare_s)
+
+
+def to_time(least: int, most: int, device: torch.device) -> tuple[range, int]:
+    """The steps to take so that `least` or more can be timed, and the first of these.
+
+    Args:
+        most: number of steps of the training.
+    """
+    # The first step includes one-time work, and batches are fetched meanwhile: those that a GPU
+    # finds ready do not show how long they took, and the next ones may arrive in a burst as large.
+    ready = ahead.ready_at_once(device)
+    steps = range(min(1 + ready + max(least, ready), most))
+    return steps, (1 + ready if 1 + ready < len(steps) else 0)
+
+
+def seconds_of(
+    steps: range,
+    first: int,
+    batches: Iterator[Any],
+    take: Callable[[int, Any], object],
+    wait: Callable[[], object],
+) -> tuple[float, float]:
+    """Mean seconds of a step from `first` on, and of its wait for its batch.
+
+    Args:
+        take: takes a step, on its batch.
+        wait: waits until the steps taken have ended.
+    """
+    started_s = data_s = 0.0
+    for index in steps:
+        if index == first:
+            wait()
+            started_s, data_s = time.perf_counter(), 0.0
+        asked_s = time.perf_counter()
+        batch = next(batches)
+        data_s += time.perf_counter() - asked_s
+        take(index, batch)
+    wait()
+    count = len(steps) - first
+    return (time.perf_counter() - started_s) / count, data_s / count
 
 
 # --- disk -----------------------------------------------------------------------------------------

@@ -333,13 +333,12 @@ def warn_of_outliers(
     """
     if settings.normalization != "mean_std":
         return
-    relative = getattr(settings, "relative_actions", False)  # streams do not have this key
     told = list[str]()
     for what, tensor, names in (
         ("action", "actions", found.action_names),
         ("position", "proprio", found.proprio_names),
     ):
-        if relative and what == "action":
+        if settings.relative_actions and what == "action":
             continue
         for one in outliers(found.tensors[tensor][found.train]):
             name = names[one.dimension] if names else str(one.dimension)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -47,6 +47,7 @@ from aegis_cli.models.buffers import WrittenBuffers
 from aegis_cli.models.policy import Policy
 from aegis_cli.recipes import Recipe, RobotTrain, Train
 from aegis_cli.training import (
+    ahead,
     assemble,
     checkpoint,
     eight_bit,
@@ -539,10 +540,10 @@ def _train(run: TrainingRun, done: int, window: Window, on_event: OnEvent) -> Tr
     told: dict[str, float] = {}
     run.policy.train()
     buffers = WrittenBuffers(run.policy.backbone)
-    ahead = batches_of(run, range(done, settings.steps))
+    fetched = batches_of(run, range(done, settings.steps))
     tracked = track.following(run.recipe, run.out, done, speaks=run.ranks.first)
     signals = interrupts.saved_first("train", on_event)
-    with ahead as batches, signals as signaled, tracked as log:
+    with fetched as batches, signals as signaled, tracked as log:
         if done < settings.steps:
             on_event(Progress("train", done, settings.steps, "steps"))
         # A run that was interrupted during a validation still has to write the line of its last
@@ -637,29 +638,11 @@ def _unlogged(run: TrainingRun) -> dict[str, bool]:
     return {} if is_logged else {UNLOGGED: True}
 
 
-@contextmanager
-def batches_of(run: TrainingRun, steps: Sequence[int]) -> Generator[Iterator[RobotBatch]]:
-    """This process's frames of each of these steps, fetched ahead.
-
-    For a GPU several threads prepare them, as a model's own processor can take longer for a batch
-    than the GPU for a step. Another thread sends only the next batch to the GPU, where a batch may
-    take gigabytes.
-    """
-    device = run.policy.backbone.device
-    if not devices.reading_stalls(device):
-        with prefetch.ahead(_fetching(run), steps) as batches:
-            yield batches
-        return
-    with (
-        prefetch.for_device(_fetching(run), steps, device) as ready,
-        prefetch.ahead(lambda _: next(ready).with_prepared_on(device), steps, 1) as sent,
-    ):
-        yield sent
-
-
-def fetched_ahead(run: TrainingRun) -> int:
-    """How many batches may be ready for a GPU before it needs one."""
-    return prefetch.workers() + 2 if devices.reading_stalls(run.policy.backbone.device) else 0
+def batches_of(
+    run: TrainingRun, steps: Sequence[int]
+) -> AbstractContextManager[Iterator[RobotBatch]]:
+    """This process's frames of each of these steps, fetched ahead."""
+    return ahead.batches(_fetching(run), steps, run.policy.backbone.device)
 
 
 def _fetching(run: TrainingRun) -> Callable[[int], RobotBatch]:
@@ -704,27 +687,20 @@ def _read(run: TrainingRun, of_step: Tensor, own: Tensor, index: int) -> RobotBa
     return dataclasses.replace(batch, images=images)
 
 
-def preparing_s(run: TrainingRun, most: int = 8) -> float:
-    """Seconds in which one thread reads this process's frames of a step, and processes them.
-
-    It is measured on up to `most` of the first step's frames.
-    """
+def preparing_s(run: TrainingRun) -> float:
+    """Seconds in which one thread reads this process's frames of a step, and processes them."""
     of_step = run.demos.train[run.order.rows(0)]
     own = _own(run, of_step)
 
-    def prepare(places: Tensor) -> float:
-        began = time.perf_counter()
+    def prepare(places: Tensor) -> None:
         batch = _read(run, of_step, places, 0)
         shown = [batch]
         if run.parts.fraction < 1:
             shown.append(step.first_frames(batch, run.parts.fraction))
         for each in shown:
             run.policy.backbone.process(each.images, each.instructions)
-        return time.perf_counter() - began
 
-    # In such a thread, which has one core.
-    with prefetch.ahead(prepare, [own[:most]]) as seconds:
-        return next(seconds) * len(own) / min(most, len(own))
+    return ahead.preparing_s(prepare, own)
 
 
 def prepared(run: TrainingRun, batch: RobotBatch, frames: Tensor, index: int) -> RobotBatch:

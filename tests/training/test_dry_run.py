@@ -307,7 +307,7 @@ def test_steps_are_timed_as_training_takes_them_and_the_memory_is_not_theirs(
     monkeypatch.setattr(train, "update", noting)
     timed = dry_run.run(settings, *given)
     assert taken == list(range(steps))
-    monkeypatch.setattr(dry_run, "_timed", lambda *_: dry_run._Timed(0.0, 0.0, 0.0))
+    monkeypatch.setattr(dry_run, "_timed", lambda *_: dry_run.Timed(0.0, 0.0, 0.0))
     assert dry_run.run(settings, *given).memory_mb == timed.memory_mb
     short = dataclasses.replace(settings, train=dataclasses.replace(settings.train, steps=1))
     assert dry_run.run(short, *given).step_s == 0.0
