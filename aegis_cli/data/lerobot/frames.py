@@ -16,7 +16,8 @@ import mmap
 import os
 import shutil
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -30,10 +31,11 @@ from aegis_cli.common import pictures as fitting
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Progress, Warned
 from aegis_cli.common.processes import mapped, worker_count
+from aegis_cli.data.episodes import as_text
 from aegis_cli.data.lerobot import layout, pictures, video
 from aegis_cli.data.lerobot.dataset import Dataset
 from aegis_cli.data.lerobot.rows import Index
-from aegis_cli.data.lerobot.source import DataFile, Source
+from aegis_cli.data.lerobot.source import CHOOSING, DataFile, Source
 
 _PART = 256  # frames decoded per call, or slightly more
 _PER_WORKER = 8  # parts that are worth starting a worker for
@@ -83,12 +85,17 @@ class ImagePart:
 
 @dataclass(frozen=True)
 class VideoPart:
-    """Frames of a video file at ascending times."""
+    """Frames of a video file at ascending times.
+
+    Attributes:
+        episodes: all episodes that are read from the file, for an error's advice.
+    """
 
     path: Path
     times: tuple[float, ...]
     tolerance: float
     first_frame: int
+    episodes: str
 
     @property
     def count(self) -> int:
@@ -96,11 +103,24 @@ class VideoPart:
 
     def decode(self) -> Iterator[np.ndarray]:
         """Frames [H, W, 3] uint8."""
-        return video.read(self.path, self.times, self.tolerance)
+        with self._advising():
+            yield from video.read(self.path, self.times, self.tolerance)
 
     def at(self, i: int) -> np.ndarray:
         """Frame `i` of the part."""
-        return next(video.read(self.path, self.times[i : i + 1], self.tolerance))
+        with self._advising():
+            return next(video.read(self.path, self.times[i : i + 1], self.tolerance))
+
+    @contextmanager
+    def _advising(self) -> Generator[None]:
+        """Name the episodes to leave out if the file is missing or damaged."""
+        try:
+            yield
+        except AegisError as error:
+            if error.fix != layout.AGAIN:  # such as a file that Git LFS has not downloaded
+                raise
+            fix = f"get the dataset again, or leave its episodes {self.episodes} out ({CHOOSING})"
+            raise AegisError(error.found, error.expected, fix) from error
 
 
 Part = ImagePart | VideoPart
@@ -273,6 +293,14 @@ def video_parts(source: Source, index: Index, camera: str) -> Iterator[VideoPart
     tolerance = 0.5 / dataset.info.fps
     ends = _clip_ends(dataset, camera)
     starts = np.cumsum([0, *(episode.length for episode in dataset.episodes)]).tolist()
+    of_file: dict[Path, list[int]] = {}
+    for number in source.episodes:
+        of_file.setdefault(dataset.episodes[number].clips[camera].file, []).append(number)
+
+    def part(path: Path, times: Sequence[float], first: int) -> VideoPart:
+        episodes = as_text(of_file[path])
+        return VideoPart(dataset.folder / path, tuple(times), tolerance, first, episodes)
+
     first, path = 0, Path()
     times: list[float] = []
     for number in source.episodes:
@@ -282,12 +310,12 @@ def video_parts(source: Source, index: Index, camera: str) -> Iterator[VideoPart
         goes_on = clip.file == path and frame == first + len(times)
         # `video.read` needs ascending times: an episode may lie before one of a lower number.
         if times and (not goes_on or own[0] <= times[-1] or len(times) >= _PART):
-            yield VideoPart(dataset.folder / path, tuple(times), tolerance, first)
+            yield part(path, times, first)
             times = []
         if not times:
             first, path = frame, clip.file
         times += own.tolist()
-    yield VideoPart(dataset.folder / path, tuple(times), tolerance, first)
+    yield part(path, times, first)
 
 
 def _clip_ends(dataset: Dataset, camera: str) -> list[float]:

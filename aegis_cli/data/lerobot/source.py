@@ -229,7 +229,7 @@ def digests(source: Source, cameras: Sequence[str], on_event: OnEvent = ignore) 
         for camera in cameras
     }
     wanted = {path: dataset.folder / path for path in sorted(shared.union(*clips.values()))}
-    hashes = kept_digests.of_files(wanted.values(), dataset.folder, on_event, layout.AGAIN)
+    hashes = kept_digests.of_files(wanted.values(), dataset.folder, on_event, WITHOUT)
     found = []
     for camera in cameras:
         own = {str(path): hashes[wanted[path]] for path in shared | clips[camera]}

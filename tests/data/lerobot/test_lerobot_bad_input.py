@@ -445,7 +445,9 @@ def test_a_corrupt_video(damage: str, bad: Bad, filmed: Path) -> None:
     )
     if damage == "missing":
         path.unlink()
-    bad(*FROM_FOLDER, says=(VIDEO,))
+        bad(*FROM_FOLDER, says=(VIDEO, "leave those episodes out (demos.only"))
+    else:
+        bad(*FROM_FOLDER, says=(VIDEO, "leave its episodes 0-", "out (demos.only"))
 
 
 def test_a_video_that_was_not_downloaded(bad: Bad, filmed: Path) -> None:
