@@ -370,7 +370,7 @@ def test_processes_wait_for_each_other_longer_than_for_a_sum(
     tiny_folder: Path, tmp_path: Path
 ) -> None:
     settings = dataclasses.replace(ALL, parts=("fisher",))
-    run_together(2, [Waiting(tiny_folder, tmp_path / "out", settings, limit_s=3, late_s=5)])
+    run_together(2, [Waiting(tiny_folder, tmp_path / "out", settings, limit_s=5, late_s=8)])
     assert (tmp_path / "out" / "anchor.safetensors").is_file()
 
 
