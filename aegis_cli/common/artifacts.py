@@ -167,8 +167,10 @@ def load(path: str | Path, kind: str | None = None, *, owner: Owner | None = Non
         tensors = {name: file.get_tensor(name) for name in sorted(file.keys())}
     again = rewrite(header.kind)
     # Only the header has units.
-    found = {name: replace(spec, unit="") for name, spec in _table(tensors, {}).items()}
-    listed = {name: replace(spec, unit="") for name, spec in header.tensors.items()}
+    found, listed = (
+        {name: (spec.shape, spec.dtype) for name, spec in table.items()}
+        for table in (_table(tensors, {}), header.tensors)
+    )
     if found != listed:
         raise AegisError(
             f"the tensors in '{path}' are not those its header lists",
@@ -216,8 +218,9 @@ def _migrate(header: Header, tensors: dict[str, Tensor]) -> tuple[Header, dict[s
     # The first migration is from schema 1, so a file with the newest schema needs none.
     for migration in MIGRATIONS.get(header.kind, ())[header.schema - 1 :]:
         tensors, meta = migration(tensors, meta)
+    # By the whole names: as patterns for each other, thousands of them would take seconds.
     units = {name: spec.unit for name, spec in header.tensors.items()}
-    table = _table(tensors, units)
+    table = {name: _spec(tensor, units.get(name, "1")) for name, tensor in tensors.items()}
     return replace(header, schema=schema(header.kind), tensors=table, meta=meta), tensors
 
 
@@ -318,11 +321,14 @@ class _OnCpu(Mapping[str, Tensor]):
 def _table(tensors: Tensors, units: Mapping[str, str]) -> dict[str, TensorSpec]:
     known = [(_matcher(pattern), unit) for pattern, unit in units.items()]
 
-    def spec(name: str, tensor: Tensor) -> TensorSpec:
-        unit = next((unit for matches, unit in known if matches(name)), "1")
-        return TensorSpec(tuple(tensor.shape), str(tensor.dtype).removeprefix("torch."), unit)
+    def unit_of(name: str) -> str:
+        return next((unit for matches, unit in known if matches(name)), "1")
 
-    return {name: spec(name, tensor) for name, tensor in tensors.items()}
+    return {name: _spec(tensor, unit_of(name)) for name, tensor in tensors.items()}
+
+
+def _spec(tensor: Tensor, unit: str) -> TensorSpec:
+    return TensorSpec(tuple(tensor.shape), str(tensor.dtype).removeprefix("torch."), unit)
 
 
 @cache

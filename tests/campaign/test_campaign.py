@@ -12,7 +12,7 @@ import pytest
 from samples.command import ROOT, finding
 
 pytestmark = pytest.mark.campaign
-MUTATIONS, KILLS = 60, 2
+MUTATIONS, KILLS = 40, 2
 
 
 def test_no_damage_no_signal_and_no_trouble_ends_in_a_defect(tmp_path: Path) -> None:

@@ -42,6 +42,20 @@ def test_samples_cover_every_kind() -> None:
     assert SAMPLES.keys() == artifacts.KINDS.keys()
 
 
+def test_no_name_is_a_pattern_when_a_file_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each for each of the others, it took seconds to read the state of a large training."""
+    tensors = {"weight.a[0]": torch.ones(2), "weight.a0": torch.ones(2)}
+    units = {"weight.a0": "m"}
+    path = tmp_path / "x.safetensors"
+    saved = artifacts.save(path, "training-state", tensors, units=units)
+    monkeypatch.setattr(artifacts, "_matcher", lambda pattern: pytest.fail(pattern))
+    assert artifacts.load(path).header == saved
+    found = {name: spec.unit for name, spec in saved.tensors.items()}
+    assert found == {**units, "weight.a[0]": "1"}
+
+
 @pytest.mark.parametrize("kind", SAMPLES)
 def test_what_is_saved_is_loaded(tmp_path: Path, kind: str) -> None:
     sample, path = SAMPLES[kind](), tmp_path / "x.safetensors"

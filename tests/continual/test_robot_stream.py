@@ -612,14 +612,26 @@ def assert_learned_and_tried(cut: Path, whole: Path) -> None:
 LATER = (("train", "freeze"), ("probe", "while_training"))
 
 
+@pytest.fixture(scope="module")
+def cut_in_the_second_task(make: Make, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An interrupted run of igsp; read-only."""
+    out = tmp_path_factory.mktemp("cut") / "run"
+    with pytest.raises(KeyboardInterrupt):
+        train.run(make("igsp"), out, on_event=partial(stop, TWO, 3))
+    return out
+
+
 @pytest.mark.parametrize("unknown", [(), LATER[1:], LATER])
 def test_a_run_that_an_earlier_version_began_goes_on_to_the_same_bytes(
-    unknown: tuple[tuple[str, str], ...], make: Make, done: Done, tmp_path: Path
+    unknown: tuple[tuple[str, str], ...],
+    cut_in_the_second_task: Path,
+    make: Make,
+    done: Done,
+    tmp_path: Path,
 ) -> None:
     """That version wrote all keys it knew into the recipe, and digested all of some sections."""
     recipe, out = make("igsp"), tmp_path / "run"
-    with pytest.raises(KeyboardInterrupt):
-        train.run(recipe, out, on_event=partial(stop, TWO, 3))
+    shutil.copytree(cut_in_the_second_task, out, symlinks=True)
     everything = dataclasses.asdict(recipe)
     written = json.loads(json.dumps(recipes.read(out / "recipe.yaml")[0]))
     for section, key in unknown:

@@ -517,17 +517,17 @@ def test_a_rollout_interrupted_within_a_group_predicts_nothing_twice(
 ) -> None:
     """Its episodes repeat the actions that they had, and nothing else of the report differs."""
     counted = Counted(monkeypatch)
-    whole = rollout.run(run_folder, None, 5, "seen", **way)
+    whole = rollout.run(run_folder, None, 3, "seen", **way)
     needed, paths = counted.asked, [env.shown[-1].proprio.tobytes() for env in envs]
     shutil.rmtree(cache.folder("episodes"))
     counted.asked, stops = 0, (3, 4, needed - 1)
     for counted.until in stops:
         with pytest.raises(KeyboardInterrupt):
-            rollout.run(run_folder, None, 5, "seen", **way)
+            rollout.run(run_folder, None, 3, "seen", **way)
         assert counted.asked == counted.until
     counted.until = math.inf
     del envs[:]
-    resumed = rollout.run(run_folder, None, 5, "seen", **way)
+    resumed = rollout.run(run_folder, None, 3, "seen", **way)
     assert counted.asked == needed and timeless(resumed) == timeless(whole)
     assert [env.shown[-1].proprio.tobytes() for env in envs] == paths
     assert resumed.episodes_per_s < 1000

@@ -97,7 +97,8 @@ def gradients(
 
 
 # These differ in the inputs of their layers: masks, windows and rotations.
-COMPILED = ("paligemma", "smolvlm", "qwen2_5_vl", "gemma3")
+# smolvlm's gradients are those of `test_a_run_with_compiled_layers_trains_alike`.
+COMPILED = ("paligemma", "qwen2_5_vl", "gemma3")
 # While tracing a graph, torch.compile accesses a field for which PyTorch warns.
 tracing = pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf")
 
@@ -205,7 +206,7 @@ def test_all_layers_and_lengths_share_what_is_compiled_once(hf_backbone: Loaded)
     assert len(made) == 2  # one for the language layers, one for the vision tower's
 
 
-@pytest.mark.parametrize("family", COMPILED[:2])
+@pytest.mark.parametrize("family", ["paligemma", "smolvlm"])
 def test_compiled_layers_find_the_same_answers(family: str, hf_backbone: Loaded) -> None:
     backbone, plain = hf_backbone(family), hf_backbone(family)
     backbone.compile_passes("eager")

@@ -291,23 +291,25 @@ def test_a_base_in_half_precision_rounds_and_says_so(hf_folder: Folder, tmp_path
     assert files_of(tmp_path / "back") == files_of(source)
 
 
-@pytest.mark.parametrize("shape", [(4, 6), (2, 3), (3, 4, 2), (8,), (2,), (1, 2), (0, 3)])
+SHAPES = ((4, 6), (2, 3), (3, 4, 2), (8,), (2,), (1, 2), (0, 3))
+
+
 @pytest.mark.parametrize(("dtype", "bits"), [("F4", 4), ("F6_E2M3", 6), ("F8_E8M0", 8)])
 def test_packed_types_beside_the_vlm_are_copied_whole(
     dtype: str,
     bits: int,
-    shape: tuple[int, ...],
     paligemma: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Of such types several numbers share a byte, and a row may end inside of one."""
-    if math.prod(shape) * bits % 8:
-        shape = (*shape, 4)  # a file holds whole bytes of each tensor
-    count = math.prod(shape) * bits // 8
-    packed = bytes(number % 251 for number in range(count))
     source = policy(tmp_path / "policy", foreign.moved(paligemma), "pi0 of openpi")
-    add_tensor(source / WEIGHTS, "action_in_proj.packed", dtype, shape, packed)
+    for place, shape in enumerate(SHAPES):
+        if math.prod(shape) * bits % 8:
+            shape = (*shape, 4)  # a file holds whole bytes of each tensor
+        count = math.prod(shape) * bits // 8
+        packed = bytes((number + place) % 251 for number in range(count))
+        add_tensor(source / WEIGHTS, f"action_in_proj.packed_{place}", dtype, shape, packed)
     monkeypatch.setattr(tensor_files, "_AT_ONCE", 2)
     take(source, paligemma, tmp_path / "vlm")
     insert.run(str(tmp_path / "vlm"), str(source), tmp_path / "back")

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
+import pickle
 import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -23,6 +25,8 @@ STATE, ACTION = ("x", "y", "z"), ("dx", "dy")
 TEXTS = ("go to the red pad", "go to the blue pad", 'grüße "the" robot')
 READABLE = ("move the finger to the red target",)  # by the embedded model
 SPEC = Spec(10.0, STATE, ACTION, "arm")
+# The files of each dataset that was written, by a digest of what it was asked for.
+_WRITTEN: dict[bytes, dict[Path, bytes]] = {}
 
 
 @pytest.fixture
@@ -68,7 +72,29 @@ def episodes(
 def save(
     folder: Path, made: list[NewEpisode] | None = None, limits: Limits = Limits(), **spec: Any
 ) -> Path:
-    """Write a dataset with the sample's names; returns its folder."""
+    """A dataset with the sample's names; returns its folder.
+
+    It has the bytes that `written` gave for the same episodes before: most tests write some of a
+    few datasets, and encoding takes twenty times as long as writing down what is known.
+    """
+    made = episodes() if made is None else made
+    asked = (made, limits, sorted(spec.items()), write._MB, write._BUFFERED)
+    key = hashlib.sha256(pickle.dumps(asked)).digest()
+    if folder.exists() or key not in _WRITTEN:
+        written(folder, made, limits, **spec)
+        files = [path for path in folder.rglob("*") if path.is_file()]
+        _WRITTEN[key] = {path.relative_to(folder): path.read_bytes() for path in files}
+        return folder
+    for name, data in _WRITTEN[key].items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(data)
+    return folder
+
+
+def written(
+    folder: Path, made: list[NewEpisode] | None = None, limits: Limits = Limits(), **spec: Any
+) -> Path:
+    """A dataset with the sample's names, always written anew; returns its folder."""
     write.write(
         folder, episodes() if made is None else made, dataclasses.replace(SPEC, **spec), limits
     )

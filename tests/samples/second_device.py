@@ -244,8 +244,7 @@ class InReach(TorchDispatchMode):
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = kwargs or {}
-        there = any(isinstance(x, StandIn) for x in _tensors(args, kwargs))
-        if there or is_there(kwargs.get("device")):
+        if StandIn in types or is_there(kwargs.get("device")):
             return compute(func, args, kwargs)
         return func(*args, **kwargs)
 

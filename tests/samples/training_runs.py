@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -116,13 +117,36 @@ def assert_same_run(one: Path, other: Path) -> None:
     assert metrics(one, TIMES) == metrics(other, TIMES)
 
 
-def assert_resumes(start: Start, method: str, recipe: Recipe, folder: Path) -> None:
-    """A run that is interrupted and resumed equals the uninterrupted one, byte for byte."""
-    start(method, folder / "whole", recipe=recipe)
+def assert_resumes(
+    start: Start, method: str, recipe: Recipe, folder: Path, whole: Path | None = None
+) -> None:
+    """A run that is interrupted and resumed equals the uninterrupted one, byte for byte.
+
+    Args:
+        whole: the uninterrupted run if there is one already; otherwise it is made in the folder.
+    """
+    if whole is None:
+        whole = folder / "whole"
+        start(method, whole, recipe=recipe)
     with pytest.raises(KeyboardInterrupt):
         start(method, folder / "cut", recipe=recipe, on_event=stop_at(3, KeyboardInterrupt()))
     start(method, folder / "cut", recipe=recipe, resume=True)
-    assert_same_run(folder / "cut", folder / "whole")
+    assert_same_run(folder / "cut", whole)
+
+
+@dataclass(frozen=True)
+class Told:
+    """A finished run, which is only read, and what was said of it."""
+
+    out: Path
+    report: train.TrainReport
+    events: list[Event]
+
+
+def told(start: Start, method: str, recipe: Recipe, out: Path) -> Told:
+    """Train, and keep what is said."""
+    events: list[Event] = []
+    return Told(out, start(method, out, recipe=recipe, on_event=events.append), events)
 
 
 def stop_at(done: int, error: BaseException) -> OnEvent:

@@ -590,9 +590,12 @@ def test_a_run_that_was_trained_by_hand_is_left_alone(small: Recipe, root: Path)
     assert content(root / "small/naive") == before and "mv " in caught.value.fix
 
 
-@pytest.mark.parametrize("name", ["notes.txt", "checkpoints/best", "plots/energy.png"])
+@pytest.mark.parametrize(
+    ("name", "methods"),
+    [("notes.txt", METHODS), ("checkpoints/best", METHODS[:1]), ("plots/energy.png", METHODS[:1])],
+)
 def test_a_run_with_files_of_the_users_own_is_moved_aside(
-    small: Recipe, root: Path, name: str
+    small: Recipe, root: Path, name: str, methods: tuple[str, ...]
 ) -> None:
     """Changed settings start a new run, but a user's notes are not removed with the old one."""
     own = root / "small" / "naive" / name
@@ -600,7 +603,8 @@ def test_a_run_with_files_of_the_users_own_is_moved_aside(
     own.write_text("weeks of work")
     before = content(root / "small/naive")
     events: list[Progress] = []
-    pipeline.run(replace(small, train=replace(small.train, steps=3)), root, events.append)
+    longer = replace(small, methods=methods, train=replace(small.train, steps=3))
+    pipeline.run(longer, root, events.append)
     (aside,) = (path for path in (root / "small").iterdir() if path.name.startswith("naive."))
     assert content(aside) == before
     assert any(f"moved {aside.name} aside" in event.stage for event in events)

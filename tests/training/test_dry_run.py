@@ -581,6 +581,6 @@ def test_a_dry_run_says_if_preparing_batches_takes_most_of_a_step_on_a_cpu(
     with monkeypatch.context() as patch:
         patch.setattr(train, "update", slower(train.update, 0.3))
         assert told() == []
-    monkeypatch.setattr(EmbeddedVLM, "process", slower(EmbeddedVLM.process, 1.0))
+    monkeypatch.setattr(EmbeddedVLM, "process", slower(EmbeddedVLM.process, 0.5))
     (text,) = told()
     assert "splits images" in text

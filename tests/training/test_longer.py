@@ -30,7 +30,6 @@ def of(recipe: Recipe, **changes: object) -> Recipe:
 @pytest.mark.parametrize(
     ("method", "schedule"),
     [
-        ("naive", "cosine"),
         ("naive", "constant"),
         ("aegis", "cosine"),
         ("nullspace", "cosine"),

@@ -553,28 +553,28 @@ def test_an_enormous_learning_rate(
 @pytest.mark.parametrize("where", ["loss", "gradient", "ledger"])
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
 def test_a_step_that_is_not_finite_is_not_taken(
+    whole_run: Callable[[str], Path],
     start: Start,
     tmp_path: Path,
-    tmp_path_factory: pytest.TempPathFactory,
     monkeypatch: pytest.MonkeyPatch,
     where: str,
     bad: float,
 ) -> None:
     """Step 4 goes wrong: the checkpoint is that of step 3, and the run can resume from it."""
-    reference = tmp_path_factory.mktemp("reference")
-    start("aegis", reference)
+    out = tmp_path / "run"  # as deep as the whole run, to which its inputs are relative
     with monkeypatch.context() as patch:
         patch.setattr(step, "compute_gradients", spoiled(where, bad, at=4))
         with pytest.raises(AegisError) as caught:
-            start("aegis", tmp_path)
+            start("aegis", out)
     assert "step 4" in caught.value.found and "3 good steps" in caught.value.fix
-    assert checkpoint.last(tmp_path).resolve().name == "000003"
-    assert finite(checkpoint.last(tmp_path))
-    assert artifacts.load(tmp_path / "ledger.safetensors").tensors["step"].tolist() == [1, 2, 3]
-    start("aegis", tmp_path, resume=True)
-    extra = {name for name in contents(tmp_path) if name.startswith("checkpoints/000003/")}
+    assert checkpoint.last(out).resolve().name == "000003"
+    assert finite(checkpoint.last(out))
+    assert artifacts.load(out / "ledger.safetensors").tensors["step"].tolist() == [1, 2, 3]
+    start("aegis", out, resume=True)
+    extra = {name for name in contents(out) if name.startswith("checkpoints/000003/")}
     assert extra
-    assert {n: v for n, v in contents(tmp_path).items() if n not in extra} == contents(reference)
+    rest = {name: value for name, value in contents(out).items() if name not in extra}
+    assert rest == contents(whole_run("aegis"))
 
 
 def test_a_divergence_right_after_a_checkpoint_leaves_it_alone(
@@ -598,6 +598,18 @@ def test_a_divergence_right_after_a_checkpoint_leaves_it_alone(
     ]
 
 
+@pytest.fixture(scope="module")
+def third(recipe: Recipe, start: Start, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run with a checkpoint at each validation; read-only."""
+    out = tmp_path_factory.mktemp("third") / "run"
+    start("naive", out, recipe=of_thirds(recipe))
+    return out
+
+
+def of_thirds(recipe: Recipe) -> Recipe:
+    return replace(recipe, train=replace(recipe.train, checkpoint_every=3))
+
+
 @pytest.mark.parametrize("times", [1, 2])
 @pytest.mark.parametrize("at", [3, STEPS])
 @pytest.mark.parametrize("relative", [True, False])
@@ -605,6 +617,7 @@ def test_a_run_interrupted_while_it_validates_keeps_the_checkpoint_of_that_step(
     relative: bool,
     at: int,
     times: int,
+    third: Path,
     recipe: Recipe,
     start: Start,
     tmp_path: Path,
@@ -612,9 +625,7 @@ def test_a_run_interrupted_while_it_validates_keeps_the_checkpoint_of_that_step(
 ) -> None:
     """Interrupted once or twice in the same validation, after a step that has a checkpoint."""
     monkeypatch.chdir(tmp_path)
-    every = replace(recipe, train=replace(recipe.train, checkpoint_every=3))
-    out = Path("run") if relative else tmp_path / "run"
-    start("naive", tmp_path / "whole", recipe=every)
+    every, out = of_thirds(recipe), Path("run") if relative else tmp_path / "run"
     measure = train.validation_loss
 
     def interrupt(*given: Any) -> float:
@@ -629,7 +640,7 @@ def test_a_run_interrupted_while_it_validates_keeps_the_checkpoint_of_that_step(
                 start("naive", out, recipe=every, resume=True)
             assert checkpoint.last(out).resolve().name == f"{at:06d}"
     start("naive", out, recipe=every, resume=True)
-    assert_same_run(out, tmp_path / "whole")
+    assert_same_run(out, third)
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
@@ -674,11 +685,10 @@ STATE_FILE = f"checkpoints/000002/{checkpoint.STATE}"
 
 @pytest.mark.parametrize("file", ["metrics.jsonl", "ledger.safetensors", MODEL_FILE, STATE_FILE])
 def test_a_full_disk_leaves_what_was_complete(
-    start: Start, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory, file: str
+    whole_run: Callable[[str], Path], start: Start, tmp_path: Path, file: str
 ) -> None:
     """The disk is full from step 3 on, so `file` no longer fits."""
-    reference = tmp_path_factory.mktemp("reference")
-    start("aegis", reference)
+    reference = whole_run("aegis")
     limit = (reference / file).stat().st_size - 1
     with pytest.raises(AegisError) as caught, largest_file_from(limit, after=3) as on_event:
         start("aegis", tmp_path, on_event=on_event)

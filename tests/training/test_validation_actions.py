@@ -17,9 +17,11 @@ from samples.training_runs import (
     STEPS,
     TIMES,
     Start,
+    Told,
     assert_resumes,
     metrics,
     stop_at,
+    told,
 )
 
 from aegis_cli import recipes
@@ -39,7 +41,7 @@ FIGURES = {"action_error", "action_error_low", "action_error_high"}
 PREDICTING = replace(SETTINGS, validate_actions=COUNT, validation_share=0.4)
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def predicting(recipe: Recipe) -> Recipe:
     """A proximal step of `kfac` covers four steps, and a validation falls within them."""
     return replace(recipe, train=PREDICTING, kfac=Kfac(every=4))
@@ -65,29 +67,44 @@ def of_metrics(line: dict[str, float]) -> dict[str, float]:
     return {name: value for name, value in line.items() if name.startswith("action_")}
 
 
+@pytest.fixture(scope="module")
+def predicting_run(
+    predicting: Recipe, start: Start, tmp_path_factory: pytest.TempPathFactory
+) -> Told:
+    """A run of `naive` that predicts."""
+    return told(start, "naive", predicting, tmp_path_factory.mktemp("predicting") / "run")
+
+
 @pytest.mark.parametrize("method", ["naive", "kfac", "lora"])
 def test_training_does_not_notice_them(
-    method: str, predicting: Recipe, start: Start, tmp_path: Path
+    method: str, predicting: Recipe, predicting_run: Told, start: Start, tmp_path: Path
 ) -> None:
-    start(method, tmp_path / "told", recipe=predicting)
-    start(method, tmp_path / "plain", recipe=without(predicting))
-    assert metrics(tmp_path / "told", TIMES | FIGURES) == metrics(tmp_path / "plain", TIMES)
+    predicts, plain = tmp_path / "predicts", tmp_path / "plain"
+    if method == "naive":
+        predicts = predicting_run.out
+    else:
+        start(method, predicts, recipe=predicting)
+    start(method, plain, recipe=without(predicting))
+    assert metrics(predicts, TIMES | FIGURES) == metrics(plain, TIMES)
     for name in ("backbone/model.safetensors", "expert.safetensors"):
-        one, other = (checkpoint.last(tmp_path / run) / name for run in ("told", "plain"))
+        one, other = (checkpoint.last(run) / name for run in (predicts, plain))
         assert one.read_bytes() == other.read_bytes()
 
 
 @pytest.mark.parametrize(
-    "changes",
+    ("method", "changes"),
     [
-        {},
-        {"ema_decay": 0.6},
-        {"normalization": "quantiles"},
-        {"validate_actions": 10_000},  # more than exist: `aegis evaluate` takes all of them too
+        ("naive", {}),
+        ("naive", {"ema_decay": 0.6}),
+        ("naive", {"normalization": "quantiles"}),
+        # More than exist: `aegis evaluate` takes all of them too.
+        ("naive", {"validate_actions": 10_000}),
+        # Its terms are merged, and averaged.
+        ("lora", {}),
+        ("lora", {"ema_decay": 0.6}),
     ],
     ids=str,
 )
-@pytest.mark.parametrize("method", ["naive", "lora"])
 def test_the_figures_are_those_of_evaluate_on_the_checkpoint(
     method: str,
     changes: dict[str, Any],
@@ -180,18 +197,16 @@ def test_nothing_is_compiled_for_predictions(
 
 
 def test_they_are_predicted_with_every_validation_loss_and_no_other_time(
-    predicting: Recipe, start: Start, tmp_path: Path
+    predicting_run: Told,
 ) -> None:
-    events: list[Event] = []
-    start("naive", tmp_path / "run", recipe=predicting, on_event=events.append)
-    lines = metrics(tmp_path / "run")
+    events, lines = predicting_run.events, metrics(predicting_run.out)
     for line in lines:
         assert ("validation_loss" in line) == FIGURES.issubset(line)
     shown = [e for e in events if isinstance(e, Progress) and e.stage == "actions"]
     # Those of the first time; it was short, so later ones would only add two lines each to a log.
     assert [e.done for e in shown] == sorted(e.done for e in shown) and shown[-1].done == COUNT
-    told = [e.metrics for e in events if isinstance(e, Progress) and e.stage == "train"][-1]
-    assert told["action error"] == lines[-1]["action_error"]
+    said = [e.metrics for e in events if isinstance(e, Progress) and e.stage == "train"][-1]
+    assert said["action error"] == lines[-1]["action_error"]
 
 
 def test_predictions_that_took_long_are_shown_again(
@@ -205,43 +220,43 @@ def test_predictions_that_took_long_are_shown_again(
 
 
 def test_a_run_goes_on_with_the_same_frames(
-    predicting: Recipe, start: Start, tmp_path: Path
+    predicting: Recipe, predicting_run: Told, start: Start, tmp_path: Path
 ) -> None:
-    assert_resumes(start, "naive", predicting, tmp_path)
+    whole = predicting_run.out
+    assert_resumes(start, "naive", predicting, tmp_path, whole)
     events: list[Event] = []
-    whole = tmp_path / "whole"
-    report = start("naive", whole, recipe=predicting, resume=True, on_event=events.append)
+    cut = tmp_path / "cut"
+    report = start("naive", cut, recipe=predicting, resume=True, on_event=events.append)
     # A finished run reports its figures and predicts nothing.
     assert not [e for e in events if getattr(e, "stage", "") == "actions"]
     assert report.validation_actions["relative_error"] == metrics(whole)[-1]["action_error"]
 
 
 def test_a_run_may_begin_or_cease_to_predict_when_it_goes_on(
-    predicting: Recipe, start: Start, tmp_path: Path
+    predicting: Recipe, predicting_run: Told, start: Start, tmp_path: Path
 ) -> None:
     with pytest.raises(KeyboardInterrupt):
         stop = stop_at(4, KeyboardInterrupt())
         start("naive", tmp_path / "run", recipe=without(predicting), on_event=stop)
     start("naive", tmp_path / "run", recipe=predicting, resume=True)
-    start("naive", tmp_path / "whole", recipe=predicting)
-    one, other = (metrics(tmp_path / name, TIMES)[-1] for name in ("run", "whole"))
+    one, other = (metrics(out, TIMES)[-1] for out in (tmp_path / "run", predicting_run.out))
     assert one == other
     kept = recipes.load(tmp_path / "run" / "recipe.yaml", kind=Recipe)
     assert kept.train.validate_actions == COUNT
 
 
-def test_inspect_and_the_page_tell_them(predicting: Recipe, start: Start, tmp_path: Path) -> None:
-    report = start("naive", tmp_path / "run", recipe=predicting)
-    found = folders.inspect(tmp_path / "run")
+def test_inspect_and_the_page_tell_them(predicting_run: Told, tmp_path: Path) -> None:
+    run, report = predicting_run.out, predicting_run.report
+    found = folders.inspect(run)
     assert found.facts["validation_actions"] == report.validation_actions
-    early = folders.inspect(tmp_path / "run" / "checkpoints" / "000004")
-    line = metrics(tmp_path / "run")[SETTINGS.validate_every - 1]
+    early = folders.inspect(run / "checkpoints" / "000004")
+    line = metrics(run)[SETTINGS.validate_every - 1]
     assert early.facts["validation_actions"]["relative_error"] == line["action_error"]
     # `aegis run` keeps the report, and reads it later for its page.
     files.save_json(tmp_path / "train.json", report.to_json())
     kept = kept_figures.read(tmp_path / "train.json", kept_figures.TrainFigures)
     assert kept["validation_actions"] == report.validation_actions
-    drawn = gather.run_document(tmp_path / "run").metrics
+    drawn = gather.run_document(run).metrics
     assert [at["step"] for at in drawn if "action_error" in at] == [3, STEPS]
 
 

@@ -16,9 +16,11 @@ from samples.training_runs import (
     STEPS,
     TIMES,
     Start,
+    Told,
     assert_resumes,
     metrics,
     stop_at,
+    told,
 )
 
 from aegis_cli import recipes
@@ -41,7 +43,7 @@ FIGURES = {"rollout_success", "rollout_low", "rollout_high"}
 Reports = list[RolloutReport]
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def playing(recipe: Recipe) -> Recipe:
     """Constraints of `nullspace` and `kfac` cover four steps, and a validation falls within them.
 
@@ -85,15 +87,29 @@ def assert_same_episodes(one: RolloutReport, other: RolloutReport, rel: float = 
     assert one.action_change == pytest.approx(other.action_change, rel=rel)
 
 
+@pytest.fixture(scope="module")
+def played_run(playing: Recipe, start: Start, tmp_path_factory: pytest.TempPathFactory) -> Told:
+    """A run of `naive` that plays."""
+    return told(start, "naive", playing, tmp_path_factory.mktemp("played") / "run")
+
+
 @pytest.mark.parametrize("method", ["naive", "kfac", "lora"])
 def test_training_does_not_notice_the_episodes(
-    method: str, playing: Recipe, start: Start, tmp_path: Path
+    method: str,
+    playing: Recipe,
+    played_run: Told,
+    start: Start,
+    tmp_path: Path,
 ) -> None:
-    start(method, tmp_path / "played", recipe=playing)
-    start(method, tmp_path / "plain", recipe=without(playing))
-    assert metrics(tmp_path / "played", TIMES | FIGURES) == metrics(tmp_path / "plain", TIMES)
+    with_episodes, plain = tmp_path / "played", tmp_path / "plain"
+    if method == "naive":
+        with_episodes = played_run.out
+    else:
+        start(method, with_episodes, recipe=playing)
+    start(method, plain, recipe=without(playing))
+    assert metrics(with_episodes, TIMES | FIGURES) == metrics(plain, TIMES)
     for name in ("backbone/model.safetensors", "expert.safetensors"):
-        one, other = (checkpoint.last(tmp_path / run) / name for run in ("played", "plain"))
+        one, other = (checkpoint.last(run) / name for run in (with_episodes, plain))
         assert one.read_bytes() == other.read_bytes()
 
 
@@ -176,38 +192,36 @@ def test_episodes_that_took_long_are_shown_again(
 
 
 def test_a_run_goes_on_with_the_same_episodes(
-    playing: Recipe, start: Start, tmp_path: Path
+    playing: Recipe, played_run: Told, start: Start, tmp_path: Path
 ) -> None:
-    assert_resumes(start, "naive", playing, tmp_path)
+    assert_resumes(start, "naive", playing, tmp_path, played_run.out)
     events: list[Event] = []
-    report = start("naive", tmp_path / "whole", recipe=playing, resume=True, on_event=events.append)
+    report = start("naive", tmp_path / "cut", recipe=playing, resume=True, on_event=events.append)
     # A finished run reports its figures and plays nothing.
     assert not [e for e in events if "rollout" in getattr(e, "stage", "")]
-    last = metrics(tmp_path / "whole")[-1]
+    last = metrics(played_run.out)[-1]
     assert report.validation_rollout["success"] == last["rollout_success"]
 
 
 def test_a_run_may_begin_or_cease_to_play_when_it_goes_on(
-    playing: Recipe, start: Start, tmp_path: Path
+    playing: Recipe, played_run: Told, start: Start, tmp_path: Path
 ) -> None:
     with pytest.raises(KeyboardInterrupt):
         stop = stop_at(4, KeyboardInterrupt())
         start("naive", tmp_path / "run", recipe=without(playing), on_event=stop)
     start("naive", tmp_path / "run", recipe=playing, resume=True)
-    start("naive", tmp_path / "whole", recipe=playing)
-    one, other = (metrics(tmp_path / name, TIMES)[-1] for name in ("run", "whole"))
+    one, other = (metrics(out, TIMES)[-1] for out in (tmp_path / "run", played_run.out))
     assert one == other
     assert recipes.load(tmp_path / "run" / "recipe.yaml", kind=Recipe).rollout.while_training
 
 
-def test_inspect_and_the_page_tell_them(playing: Recipe, start: Start, tmp_path: Path) -> None:
-    report = start("naive", tmp_path / "run", recipe=playing)
-    found = folders.inspect(tmp_path / "run")
+def test_inspect_and_the_page_tell_them(played_run: Told, tmp_path: Path) -> None:
+    run, report = played_run.out, played_run.report
+    found = folders.inspect(run)
     assert found.facts["validation_rollout"] == report.validation_rollout
-    early = folders.inspect(tmp_path / "run" / "checkpoints" / "000004")
-    line = metrics(tmp_path / "run")[SETTINGS.validate_every - 1]
-    told = early.facts["validation_rollout"]
-    assert told == {
+    early = folders.inspect(run / "checkpoints" / "000004")
+    line = metrics(run)[SETTINGS.validate_every - 1]
+    assert early.facts["validation_rollout"] == {
         "success": line["rollout_success"],
         "interval": [line["rollout_low"], line["rollout_high"]],
     }
@@ -215,7 +229,7 @@ def test_inspect_and_the_page_tell_them(playing: Recipe, start: Start, tmp_path:
     files.save_json(tmp_path / "train.json", report.to_json())
     kept = kept_figures.read(tmp_path / "train.json", kept_figures.TrainFigures)
     assert kept["validation_rollout"] == report.validation_rollout
-    drawn = gather.run_document(tmp_path / "run").metrics
+    drawn = gather.run_document(run).metrics
     assert [at["step"] for at in drawn if "rollout_success" in at] == [3, STEPS]
 
 

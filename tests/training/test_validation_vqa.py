@@ -13,9 +13,11 @@ from samples.training_runs import (
     STEPS,
     TIMES,
     Start,
+    Told,
     assert_resumes,
     metrics,
     stop_at,
+    told,
 )
 from samples.vqa_files import write_jsonl
 
@@ -37,7 +39,7 @@ COUNT = 21
 FIGURES = {f"vqa_{name}" for name in validation_vqa._FIGURES}
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def asking(recipe: Recipe) -> Recipe:
     """Constraints of `nullspace` and `kfac` cover four steps, and a validation falls within."""
     return replace(
@@ -52,15 +54,33 @@ def without(recipe: Recipe) -> Recipe:
     return replace(recipe, probe=replace(recipe.probe, while_training=None))
 
 
+@pytest.fixture(scope="module")
+def asked_run(asking: Recipe, start: Start, tmp_path_factory: pytest.TempPathFactory) -> Told:
+    """A run of `naive` that asks."""
+    return told(start, "naive", asking, tmp_path_factory.mktemp("asked") / "run")
+
+
 @pytest.mark.parametrize("method", ["naive", "nullspace", "kfac", "lora", "aegis"])
 def test_training_does_not_notice_the_questions(
-    method: str, asking: Recipe, start: Start, tmp_path: Path
+    method: str,
+    asking: Recipe,
+    asked_run: Told,
+    whole_run: Callable[[str], Path],
+    start: Start,
+    tmp_path: Path,
 ) -> None:
-    start(method, tmp_path / "asked", recipe=asking)
-    start(method, tmp_path / "plain", recipe=without(asking))
-    assert metrics(tmp_path / "asked", TIMES | FIGURES) == metrics(tmp_path / "plain", TIMES)
+    asked, plain = tmp_path / "asked", tmp_path / "plain"
+    if method == "naive":
+        asked = asked_run.out
+    else:
+        start(method, asked, recipe=asking)
+    if method in ("nullspace", "kfac"):  # whose settings are not those of other tests
+        start(method, plain, recipe=without(asking))
+    else:
+        plain = whole_run(method)
+    assert metrics(asked, TIMES | FIGURES) == metrics(plain, TIMES)
     for name in ("backbone/model.safetensors", "expert.safetensors"):
-        one, other = (checkpoint.last(tmp_path / run) / name for run in ("asked", "plain"))
+        one, other = (checkpoint.last(run) / name for run in (asked, plain))
         assert one.read_bytes() == other.read_bytes()
 
 
@@ -119,17 +139,14 @@ def test_a_model_that_has_nothing_to_lose_is_warned_of_before_the_first_step(
     assert len(found) == (not knows) and all(number < first for number in found)
 
 
-def test_they_are_asked_with_every_validation_loss_and_no_other_time(
-    asking: Recipe, start: Start, tmp_path: Path
-) -> None:
-    events: list[Event] = []
-    start("naive", tmp_path / "run", recipe=asking, on_event=events.append)
-    for line in metrics(tmp_path / "run"):
+def test_they_are_asked_with_every_validation_loss_and_no_other_time(asked_run: Told) -> None:
+    events = asked_run.events
+    for line in metrics(asked_run.out):
         assert ("validation_loss" in line) == FIGURES.issubset(line)
     before = [e for e in events if getattr(e, "stage", "") == "VQA before training"]
     assert [e.done for e in before if isinstance(e, Progress)] == [0, 8, 16, COUNT]
     shown = [e.metrics.get("VQA drop") for e in events if isinstance(e, Progress)]
-    last = metrics(tmp_path / "run")[-1]
+    last = metrics(asked_run.out)[-1]
     assert shown[-1] == last["vqa_drop_points"]
 
 
@@ -156,28 +173,25 @@ def test_a_model_that_stands_still_is_asked_once(
 
 
 def test_a_run_goes_on_with_the_same_answers_before(
-    asking: Recipe, start: Start, tmp_path: Path
+    asking: Recipe, asked_run: Told, start: Start, tmp_path: Path
 ) -> None:
-    assert_resumes(start, "naive", asking, tmp_path)
+    assert_resumes(start, "naive", asking, tmp_path, asked_run.out)
     events: list[Event] = []
-    report = start("naive", tmp_path / "whole", recipe=asking, resume=True, on_event=events.append)
+    report = start("naive", tmp_path / "cut", recipe=asking, resume=True, on_event=events.append)
     # A finished run reports its figures and asks nothing.
     assert not [e for e in events if "VQA" in getattr(e, "stage", "")]
-    assert (
-        report.validation_vqa["scenes"]["accuracy"]
-        == metrics(tmp_path / "whole")[-1]["vqa_accuracy"]
-    )
+    accuracy = metrics(asked_run.out)[-1]["vqa_accuracy"]
+    assert report.validation_vqa["scenes"]["accuracy"] == accuracy
 
 
 def test_a_run_may_begin_or_cease_to_ask_when_it_goes_on(
-    asking: Recipe, start: Start, tmp_path: Path
+    asking: Recipe, asked_run: Told, start: Start, tmp_path: Path
 ) -> None:
     with pytest.raises(KeyboardInterrupt):
         stop = stop_at(4, KeyboardInterrupt())
         start("naive", tmp_path / "run", recipe=without(asking), on_event=stop)
     start("naive", tmp_path / "run", recipe=asking, resume=True)
-    start("naive", tmp_path / "whole", recipe=asking)
-    one, other = (metrics(tmp_path / name, TIMES)[-1] for name in ("run", "whole"))
+    one, other = (metrics(out, TIMES)[-1] for out in (tmp_path / "run", asked_run.out))
     assert one == other
     assert recipes.load(tmp_path / "run" / "recipe.yaml", kind=Recipe).probe.while_training
 
@@ -193,19 +207,19 @@ def test_each_set_has_figures_of_its_own(asking: Recipe, start: Start, tmp_path:
     assert line["vqa_cross_entropy_2"] == pytest.approx(second.cross_entropy, rel=1e-5)
 
 
-def test_inspect_and_the_page_tell_them(asking: Recipe, start: Start, tmp_path: Path) -> None:
-    report = start("naive", tmp_path / "run", recipe=asking)
-    found = folders.inspect(tmp_path / "run")
+def test_inspect_and_the_page_tell_them(asked_run: Told, tmp_path: Path) -> None:
+    run, report = asked_run.out, asked_run.report
+    found = folders.inspect(run)
     assert found.facts["validation_vqa"] == report.validation_vqa
-    early = folders.inspect(tmp_path / "run" / "checkpoints" / "000004")
-    line = metrics(tmp_path / "run")[SETTINGS.validate_every - 1]
+    early = folders.inspect(run / "checkpoints" / "000004")
+    line = metrics(run)[SETTINGS.validate_every - 1]
     told = early.facts["validation_vqa"]["scenes"]
     assert told["cross_entropy"] == line["vqa_cross_entropy"]
     # `aegis run` keeps the report, and reads it later for its page.
     files.save_json(tmp_path / "train.json", report.to_json())
     kept = kept_figures.read(tmp_path / "train.json", kept_figures.TrainFigures)
     assert kept["validation_vqa"] == report.validation_vqa
-    drawn = gather.run_document(tmp_path / "run").metrics
+    drawn = gather.run_document(run).metrics
     assert [at["step"] for at in drawn if "vqa_drop_points" in at] == [3, STEPS]
 
 

@@ -20,8 +20,8 @@ from samples.lerobot import (
     frames,
     joined,
     read,
-    save,
 )
+from samples.lerobot import written as save  # what is tested is how it is written
 
 from aegis_cli.common.errors import AegisError
 from aegis_cli.data.lerobot import dataset, layout, rows, source, version_3, write
