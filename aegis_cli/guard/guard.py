@@ -391,6 +391,16 @@ class Guard(Removable):
         self._check_ready()
         self._stepper.settle()
 
+    def drop_pending(self) -> None:
+        """Forget the pending steps, after other weights were loaded into the model.
+
+        The next step starts from the loaded weights. `nullspace` protects them from there on, and
+        `kfac` still pulls towards the pre-trained ones. What was pending is not constrained, so do
+        not call this for weights that the pending steps have moved: see `settle`.
+        """
+        self._check_ready()
+        self._stepper.drop_pending()
+
     def remove(self) -> None:
         """Settle, and remove all hooks from the model."""
         self._stepper.settle()

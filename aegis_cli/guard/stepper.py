@@ -20,6 +20,7 @@ from torch.optim.optimizer import (
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.ranks import ALONE, Ranks
 from aegis_cli.guard.learning_parameters import LearningParameters
+from aegis_cli.guard.pending_watch import PendingWatch
 from aegis_cli.methods.base import Parts
 from aegis_cli.methods.stepper import Stepper
 from aegis_cli.models.buffers import WrittenBuffers
@@ -65,10 +66,12 @@ class GuardedStepper:
         _AT_WORK.add(self)
         # On every optimizer of the process: that of the loop may be created after the guard.
         before, after = _hooks_of_every_optimizer(self)
-        self._hooks = [
+        self._hooks: list[Any] = [
             register_optimizer_step_pre_hook(before),
             register_optimizer_step_post_hook(after),
         ]
+        if parts.every > 1:  # otherwise no step is pending once it has ended
+            self._hooks.append(PendingWatch(model, self._stepper))
 
     def take_by_itself(self, anchor: Callable[[], Mapping[int, Tensor | None]]) -> None:
         """Constrain the steps that a loop takes by `optimizer.step()`, instead of refusing them.
@@ -223,6 +226,12 @@ class GuardedStepper:
         self._end_broken_step()
         self._stepper.settle()
         # A model saved now may be continued by a new guard, which counts from here.
+        self._count = 0
+
+    def drop_pending(self) -> None:
+        """Forget the pending steps: the next one is the first since the present weights."""
+        self._own = None
+        self._stepper.drop_pending()
         self._count = 0
 
     def is_of_all(self, optimizer: Optimizer) -> bool:
