@@ -126,7 +126,9 @@ class Guard(Removable):
         )
         # Naming the kinds to protect is a decision about all others too.
         averaging = {} if dual or "protect" in options else structure.averaging(model)
-        self._stepper = GuardedStepper(model, self._parts, self._owners.several, averaging)
+        self._stepper = GuardedStepper(
+            model, self._parts, self._owners.several, averaging, started.why_strong
+        )
         self._hooks = LayerHooks(found)
         self._seen: Pass | None = None
         self._dual: DualBackward | None = None

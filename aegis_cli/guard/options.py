@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Collection, Container, Generator, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Container, Generator, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from aegis_cli.common.errors import AegisError, few
 from aegis_cli.common.ranks import Ranks
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.spectrum import DENSE
+from aegis_cli.methods import kfac
 from aegis_cli.methods.base import MethodContext, Parts
 from aegis_cli.methods.site_weights import weights
 from aegis_cli.models import structure, wrappers
@@ -50,12 +51,14 @@ class StartedMethod:
         widths: widths of the anchor's layers.
         unprotected: trainable modules that the method leaves free.
         sha256: hash of the anchor's file.
+        why_strong: why the model may learn little at a learning rate; None if it does learn.
     """
 
     parts: Parts
     widths: list[int]
     unprotected: tuple[str, ...]
     sha256: str
+    why_strong: Callable[[float], str | None]
 
 
 def start(
@@ -107,7 +110,13 @@ def start(
         constrained = {site: weights(model, site)[0] for site in sites} or structure.learning(model)
         check_precision({name: tensor.dtype for name, tensor in constrained.items()})
     widths = [len(moments.mean) for moments in anchor.text]
-    return StartedMethod(parts, widths, unprotected, artifacts.sha256_file(path))
+
+    def why_strong(rate: float) -> str | None:
+        if method != "kfac":
+            return None
+        return kfac.why_strong(chosen["weight"], rate, "the guard's option weight")
+
+    return StartedMethod(parts, widths, unprotected, artifacts.sha256_file(path), why_strong)
 
 
 def method_options(method: str, options: Mapping[str, Any]) -> dict[str, Any]:

@@ -43,6 +43,7 @@ class GuardedStepper:
         parts: Parts,
         may_shard: bool = False,
         averaging: Mapping[str, nn.Module] | None = None,
+        why_strong: Callable[[float], str | None] = lambda rate: None,
     ) -> None:
         """Create a stepper that has taken no step yet.
 
@@ -50,6 +51,7 @@ class GuardedStepper:
             may_shard: as for `Stepper`.
             averaging: modules, by name, that must not update running averages of their inputs
                 while the method is active.
+            why_strong: why the model may learn little at a learning rate; None if it does learn.
         """
         self._parts, self._averaging = parts, averaging or {}
         self._learning = LearningParameters(model)
@@ -62,7 +64,7 @@ class GuardedStepper:
         # Nesting depth, for an optimizer that calls the step of its base class or of another one.
         self._depth, self._in_closure = 0, False
         self._tells = False  # whether any optimizer has ever reported a step
-        self._buffers = _BufferWatch(model)
+        self._buffers, self._rates = _BufferWatch(model), _RateWatch(why_strong)
         _AT_WORK.add(self)
         # On every optimizer of the process: that of the loop may be created after the guard.
         before, after = _hooks_of_every_optimizer(self)
@@ -193,6 +195,7 @@ class GuardedStepper:
         self._refuse_unguarded(optimizer)
         self._refuse_second(optimizer)
         self._refuse_unreached()
+        self._rates.look(self._learning.groups_of(optimizer))
         self._stepper.begin(self._learning.by_name(anchor))
         # Before the step: the shares come from the gradients that the step uses.
         slowed = SlowedStep(self._parts)
@@ -287,6 +290,7 @@ class GuardedStepper:
         self._learning.refuse_others()
         self._refuse_unreached()
         self._refuse_second(optimizer)
+        self._rates.look(self._learning.groups_of(optimizer))
         self._stepper.begin(self._learning.by_name(self._automatic()))
         self._own = _OwnStep(SlowedStep(self._parts), self._learning.versions())
 
@@ -439,6 +443,26 @@ class _BufferWatch:
             "module.eval() for each of these modules after model.train()",
             stacklevel=2,
         )
+
+
+class _RateWatch:
+    """Warns at the peak of the learning rate if a method is too strong for it."""
+
+    def __init__(self, why_strong: Callable[[float], str | None]) -> None:
+        self._why_strong, self._highest, self._looked = why_strong, 0.0, False
+
+    def look(self, groups: Sequence[Mapping[str, Any]]) -> None:
+        """Check the rates of a step's groups."""
+        if self._looked:
+            return
+        rate = max((float(group.get("lr", 0)) for group in groups), default=0.0)
+        # A warm-up begins far below the peak, so wait until the rate rises no further.
+        if rate > self._highest or rate == 0:
+            self._highest = max(rate, self._highest)
+            return
+        self._looked = True
+        if why := self._why_strong(self._highest):
+            warnings.warn(why, stacklevel=2)
 
 
 class SlowedStep:
