@@ -272,8 +272,16 @@ def _check_adapters(
     """
     held = wrappers.adapter_weights(model)
     inside = [site for site in sites if any(name.startswith(f"{site}.") for name in held)]
-    if not inside or header.meta.get("adapted") == structure.fingerprint(model, adapters=True):
+    measured = header.meta.get("adapted")
+    if not inside or measured == structure.fingerprint(model, adapters=True):
         return
+    if measured is not None:
+        raise AegisError(
+            f"anchor '{path}' was measured with adapters of other values than these: {few(inside)}",
+            "the adapters that were measured: fresh ones begin at random values",
+            "save them before you measure (model.save_pretrained(folder)) and load them here "
+            "(PeftModel.from_pretrained(base, folder, is_trainable=True)), or measure these",
+        )
     raise AegisError(
         f"anchor '{path}' was measured without these adapters: {few(inside)}",
         "an anchor of the model with its adapters, since they are what learns",

@@ -356,14 +356,25 @@ class GuardedStepper:
         if self._since.guarded and id(optimizer) not in self._since.stepped:
             return
         # Some libraries take a step with zero gradients to initialise an optimizer's state.
-        if any(gradient.any() for gradient in self._learning.gradients()):
-            raise AegisError(
-                "a step on guarded parameters without a guard.backward since the last one",
-                "guard.backward(loss) instead of loss.backward(), before every step",
-                "call guard.backward in the loop that trains; where a trainer calls backward "
-                "itself, guard.automatic(), or Trainer(callbacks=[guard.callback()]); "
-                "guard.remove() when done",
-            )
+        if not any(gradient.any() for gradient in self._learning.gradients()):
+            return
+        found = "a step on guarded parameters without a guard.backward since the last one"
+        for other in _AT_WORK:
+            if other is not self and (shared := other._learning.shared_with(self._learning)):
+                raise AegisError(
+                    f"{found}, of one of two guards on {len(shared)} parameters, first "
+                    f"'{shared[0]}'",
+                    "each guard sees every backward pass, and only one can be called in the loop",
+                    "guard.automatic() for one of them, or for both and a loop with "
+                    "loss.backward() and optimizer.step(); guard.remove() for one that is done",
+                )
+        raise AegisError(
+            found,
+            "guard.backward(loss) instead of loss.backward(), before every step",
+            "call guard.backward in the loop that trains; where a trainer calls backward "
+            "itself, guard.automatic(), or Trainer(callbacks=[guard.callback()]); "
+            "guard.remove() when done",
+        )
 
 
 @dataclass
