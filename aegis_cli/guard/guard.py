@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 from collections.abc import Generator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
@@ -20,7 +21,7 @@ from aegis_cli.common.ranks import ALONE, Ranks
 from aegis_cli.guard import process_groups
 from aegis_cli.guard.automatic import AutomaticLoop, LoopHooks, Source
 from aegis_cli.guard.dual_backward import DualBackward, check_pass, diverged
-from aegis_cli.guard.options import SECTIONS, naming_its_part, start
+from aegis_cli.guard.options import SECTIONS, is_pretrained, naming_its_part, start
 from aegis_cli.guard.process_groups import ProcessGroup
 from aegis_cli.guard.stepper import GuardedStepper, Scaler
 from aegis_cli.guard.trainer_callback import trainer_callback
@@ -119,7 +120,7 @@ class Guard(Removable):
         pixels = structure.plain_parts(model, vision)
         started = start(method, model, path, found, groups, pixels, options, self._owners, part)
         self._parts, self._widths = started.parts, started.widths
-        self.unprotected = started.unprotected
+        self.unprotected, self._fingerprint = started.unprotected, started.fingerprint
         self._compared = _COMPARED[options.get("scope", "all")]
         self.ledger = LedgerOutsideRuns(
             list(groups), [f"layers.{i}" for i in range(len(found))], method, started.sha256
@@ -291,7 +292,8 @@ class Guard(Removable):
         Raises:
             AegisError: transformers is not installed.
         """
-        return trainer_callback(self, self._model, mask, image)
+        untrained = functools.partial(is_pretrained, self._model, self._fingerprint)
+        return trainer_callback(self, self._model, mask, image, untrained)
 
     @property
     def is_automatic(self) -> bool:

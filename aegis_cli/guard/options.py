@@ -51,6 +51,7 @@ class StartedMethod:
         widths: widths of the anchor's layers.
         unprotected: trainable modules that the method leaves free.
         sha256: hash of the anchor's file.
+        fingerprint: that of the weights that the anchor was measured on.
         why_strong: why the model may learn little at a learning rate; None if it does learn.
     """
 
@@ -58,6 +59,7 @@ class StartedMethod:
     widths: list[int]
     unprotected: tuple[str, ...]
     sha256: str
+    fingerprint: str | None
     why_strong: Callable[[float], str | None]
 
 
@@ -116,7 +118,17 @@ def start(
             return None
         return kfac.why_strong(chosen["weight"], rate, "the guard's option weight")
 
-    return StartedMethod(parts, widths, unprotected, artifacts.sha256_file(path), why_strong)
+    sha256 = artifacts.sha256_file(path)
+    return StartedMethod(parts, widths, unprotected, sha256, header.fingerprint, why_strong)
+
+
+def is_pretrained(model: nn.Module, fingerprint: str | None) -> bool:
+    """Whether a model has exactly the weights that an anchor was measured on.
+
+    Args:
+        fingerprint: that of the anchor.
+    """
+    return any(structure.fingerprint(model, within=w) == fingerprint for w in ("", _IN_BACKBONE))
 
 
 def method_options(method: str, options: Mapping[str, Any]) -> dict[str, Any]:
@@ -229,7 +241,7 @@ def _measured_part(model: nn.Module, path: Path) -> str | None:
         return None
     for name in structure.around_blocks(model):
         inside = structure.part_of(model, name)
-        if wanted in (structure.fingerprint(inside, within=w) for w in ("", _IN_BACKBONE)):
+        if is_pretrained(inside, wanted):
             return name
     return None
 

@@ -195,6 +195,29 @@ def test_a_trainer_saves_settled_weights(guarded: Guarded, tmp_path: Path) -> No
     assert len(saved) == STEPS
 
 
+@pytest.mark.parametrize("loads", [True, False])
+def test_a_trainer_that_resumes_without_the_learned_weights_is_refused(
+    loads: bool, guarded: Guarded, tmp_path: Path
+) -> None:
+    """As one does whose names in the file are not those of the model, which it only warns of."""
+    model, guard = guarded("nullspace")
+    given = trainer(model, tmp_path, [guard.callback()], save_strategy="steps", save_steps=1)
+    given.save_model = lambda folder, **_: Path(folder).mkdir()
+    given.train()
+    other, its = guarded("nullspace")
+    given = trainer(other, tmp_path, [its.callback()], num_train_epochs=2)
+    given._load_from_checkpoint = lambda *_: other.load_state_dict(
+        model.state_dict() if loads else {}, strict=loads
+    )
+    checkpoint = str(tmp_path / f"checkpoint-{STEPS}")
+    if loads:
+        given.train(resume_from_checkpoint=checkpoint)
+        assert given.state.global_step == 2 * STEPS
+        return
+    with pytest.raises(AegisError, match=f"resumes at step {STEPS} with the pre-trained weights"):
+        given.train(resume_from_checkpoint=checkpoint)
+
+
 @every_method
 def test_a_trainer_beside_a_guard_is_refused(method: str, guarded: Guarded, tmp_path: Path) -> None:
     model, _guard = guarded(method)
