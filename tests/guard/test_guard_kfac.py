@@ -122,6 +122,19 @@ def test_what_no_answer_reads_does_not_count(tmp_path: Path) -> None:
         torch.testing.assert_close(spectrum.values, spectra[1][name].values, rtol=1e-6, atol=1e-15)
 
 
+def test_probabilities_in_place_of_scores_are_refused() -> None:
+    """Logarithms of probabilities are scores too."""
+    for dtype in (torch.float64, torch.bfloat16):
+        model, (pixels, ids, mask) = make(), batch(0)
+        with Guard.measure(model, parts=("curvature",)) as found:
+            with found.watch(mask):
+                scores = model(pixels, ids, mask)[:, -3].to(dtype)
+            with pytest.raises(AegisError, match="that are probabilities") as caught:
+                found.answer(scores.softmax(-1))
+            assert "logits" in caught.value.expected
+            found.answer(scores.log_softmax(-1))
+
+
 class FamilyNorm(nn.Module):
     """The RMS norm of a model family: a class of its own, recognised by its behaviour."""
 
