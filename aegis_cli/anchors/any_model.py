@@ -85,8 +85,9 @@ class Measurement(Removable):
         refuse_sharded(model)
         structure.refuse_offloaded(model)
         if found := structure.compiled(model):
+            named = f"'{found[0]}'" if found[0] else "the model itself"
             raise AegisError(
-                f"'{found[0]}' under torch.compile",
+                f"{named} under torch.compile",
                 "a model not yet compiled",
                 "measure first, then compile",
             )
@@ -171,8 +172,8 @@ class Measurement(Removable):
                 of answers.
 
         Raises:
-            AegisError: scores without a graph or without a position, or a measurement without
-                curvature.
+            AegisError: scores without a graph or without a position, probabilities, or a
+                measurement without curvature.
         """
         if self._curvature is None:
             raise AegisError(
@@ -188,6 +189,12 @@ class Measurement(Removable):
                 found,
                 "scores [n, V] of a watched pass",
                 "model.requires_grad_(True), and no torch.no_grad around the pass",
+            )
+        if _are_probabilities(scores.detach()):
+            raise AegisError(
+                f"scores {list(scores.shape)} that are probabilities",
+                "logits [n, V], as the model's head computes them",
+                "leave .softmax(-1) out; .log_softmax(-1) does no harm",
             )
         self._curvature.answer(scores.flatten(0, -2))
         self._unanswered = False
@@ -259,3 +266,10 @@ class Measurement(Removable):
     def _add_samples(self, count: int | None) -> None:
         known = self._samples
         self._samples = None if known is None or count is None else known + count
+
+
+def _are_probabilities(scores: Tensor) -> bool:
+    """Whether every row sums to 1 and no entry is negative, as no head's logits do by chance."""
+    off = (scores.sum(-1, dtype=torch.float32) - 1).abs().max()
+    # Rounding to half precision leaves the sum off by up to about 0.004.
+    return scores.shape[-1] > 1 and bool((scores.min() >= 0) & (off < 1e-2))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 from collections.abc import Generator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
@@ -20,7 +21,7 @@ from aegis_cli.common.ranks import ALONE, Ranks
 from aegis_cli.guard import process_groups
 from aegis_cli.guard.automatic import AutomaticLoop, LoopHooks, Source
 from aegis_cli.guard.dual_backward import DualBackward, check_pass, diverged
-from aegis_cli.guard.options import SECTIONS, naming_its_part, start
+from aegis_cli.guard.options import SECTIONS, is_pretrained, naming_its_part, start
 from aegis_cli.guard.process_groups import ProcessGroup
 from aegis_cli.guard.stepper import GuardedStepper, Scaler
 from aegis_cli.guard.trainer_callback import trainer_callback
@@ -119,14 +120,16 @@ class Guard(Removable):
         pixels = structure.plain_parts(model, vision)
         started = start(method, model, path, found, groups, pixels, options, self._owners, part)
         self._parts, self._widths = started.parts, started.widths
-        self.unprotected = started.unprotected
+        self.unprotected, self._fingerprint = started.unprotected, started.fingerprint
         self._compared = _COMPARED[options.get("scope", "all")]
         self.ledger = LedgerOutsideRuns(
             list(groups), [f"layers.{i}" for i in range(len(found))], method, started.sha256
         )
         # Naming the kinds to protect is a decision about all others too.
         averaging = {} if dual or "protect" in options else structure.averaging(model)
-        self._stepper = GuardedStepper(model, self._parts, self._owners.several, averaging)
+        self._stepper = GuardedStepper(
+            model, self._parts, self._owners.several, averaging, started.why_strong
+        )
         self._hooks = LayerHooks(found)
         self._seen: Pass | None = None
         self._dual: DualBackward | None = None
@@ -289,7 +292,8 @@ class Guard(Removable):
         Raises:
             AegisError: transformers is not installed.
         """
-        return trainer_callback(self, self._model, mask, image)
+        untrained = functools.partial(is_pretrained, self._model, self._fingerprint)
+        return trainer_callback(self, self._model, mask, image, untrained)
 
     @property
     def is_automatic(self) -> bool:
@@ -390,6 +394,16 @@ class Guard(Removable):
         """
         self._check_ready()
         self._stepper.settle()
+
+    def drop_pending(self) -> None:
+        """Forget the pending steps, after other weights were loaded into the model.
+
+        The next step starts from the loaded weights. `nullspace` protects them from there on, and
+        `kfac` still pulls towards the pre-trained ones. What was pending is not constrained, so do
+        not call this for weights that the pending steps have moved: see `settle`.
+        """
+        self._check_ready()
+        self._stepper.drop_pending()
 
     def remove(self) -> None:
         """Settle, and remove all hooks from the model."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from typing import Any
 
 from torch import Tensor, nn
 from torch.optim.optimizer import Optimizer
@@ -96,8 +97,12 @@ class LearningParameters:
 
     def are_in(self, optimizer: Optimizer) -> bool:
         """Whether an optimizer has any of them."""
+        return bool(self.groups_of(optimizer))
+
+    def groups_of(self, optimizer: Optimizer) -> list[dict[str, Any]]:
+        """The optimizer's groups that have any of them."""
         mine = self._ids()
-        return any(id(p) in mine for group in optimizer.param_groups for p in group["params"])
+        return [g for g in optimizer.param_groups if any(id(p) in mine for p in g["params"])]
 
     def are_all_in(self, optimizer: Optimizer) -> bool:
         """Whether an optimizer has all of them, so that no other one shares its step.

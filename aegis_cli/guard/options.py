@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Collection, Container, Generator, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Container, Generator, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from aegis_cli.common.errors import AegisError, few
 from aegis_cli.common.ranks import Ranks
 from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.spectrum import DENSE
+from aegis_cli.methods import kfac
 from aegis_cli.methods.base import MethodContext, Parts
 from aegis_cli.methods.site_weights import weights
 from aegis_cli.models import structure, wrappers
@@ -50,12 +51,16 @@ class StartedMethod:
         widths: widths of the anchor's layers.
         unprotected: trainable modules that the method leaves free.
         sha256: hash of the anchor's file.
+        fingerprint: that of the weights that the anchor was measured on.
+        why_strong: why the model may learn little at a learning rate; None if it does learn.
     """
 
     parts: Parts
     widths: list[int]
     unprotected: tuple[str, ...]
     sha256: str
+    fingerprint: str | None
+    why_strong: Callable[[float], str | None]
 
 
 def start(
@@ -107,7 +112,23 @@ def start(
         constrained = {site: weights(model, site)[0] for site in sites} or structure.learning(model)
         check_precision({name: tensor.dtype for name, tensor in constrained.items()})
     widths = [len(moments.mean) for moments in anchor.text]
-    return StartedMethod(parts, widths, unprotected, artifacts.sha256_file(path))
+
+    def why_strong(rate: float) -> str | None:
+        if method != "kfac":
+            return None
+        return kfac.why_strong(chosen["weight"], rate, "the guard's option weight")
+
+    sha256 = artifacts.sha256_file(path)
+    return StartedMethod(parts, widths, unprotected, sha256, header.fingerprint, why_strong)
+
+
+def is_pretrained(model: nn.Module, fingerprint: str | None) -> bool:
+    """Whether a model has exactly the weights that an anchor was measured on.
+
+    Args:
+        fingerprint: that of the anchor.
+    """
+    return any(structure.fingerprint(model, within=w) == fingerprint for w in ("", _IN_BACKBONE))
 
 
 def method_options(method: str, options: Mapping[str, Any]) -> dict[str, Any]:
@@ -220,7 +241,7 @@ def _measured_part(model: nn.Module, path: Path) -> str | None:
         return None
     for name in structure.around_blocks(model):
         inside = structure.part_of(model, name)
-        if wanted in (structure.fingerprint(inside, within=w) for w in ("", _IN_BACKBONE)):
+        if is_pretrained(inside, wanted):
             return name
     return None
 
@@ -263,8 +284,16 @@ def _check_adapters(
     """
     held = wrappers.adapter_weights(model)
     inside = [site for site in sites if any(name.startswith(f"{site}.") for name in held)]
-    if not inside or header.meta.get("adapted") == structure.fingerprint(model, adapters=True):
+    measured = header.meta.get("adapted")
+    if not inside or measured == structure.fingerprint(model, adapters=True):
         return
+    if measured is not None:
+        raise AegisError(
+            f"anchor '{path}' was measured with adapters of other values than these: {few(inside)}",
+            "the adapters that were measured: fresh ones begin at random values",
+            "save them before you measure (model.save_pretrained(folder)) and load them here "
+            "(PeftModel.from_pretrained(base, folder, is_trainable=True)), or measure these",
+        )
     raise AegisError(
         f"anchor '{path}' was measured without these adapters: {few(inside)}",
         "an anchor of the model with its adapters, since they are what learns",

@@ -20,6 +20,7 @@ from torch.optim.optimizer import (
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.ranks import ALONE, Ranks
 from aegis_cli.guard.learning_parameters import LearningParameters
+from aegis_cli.guard.pending_watch import PendingWatch
 from aegis_cli.methods.base import Parts
 from aegis_cli.methods.stepper import Stepper
 from aegis_cli.models.buffers import WrittenBuffers
@@ -42,6 +43,7 @@ class GuardedStepper:
         parts: Parts,
         may_shard: bool = False,
         averaging: Mapping[str, nn.Module] | None = None,
+        why_strong: Callable[[float], str | None] = lambda rate: None,
     ) -> None:
         """Create a stepper that has taken no step yet.
 
@@ -49,6 +51,7 @@ class GuardedStepper:
             may_shard: as for `Stepper`.
             averaging: modules, by name, that must not update running averages of their inputs
                 while the method is active.
+            why_strong: why the model may learn little at a learning rate; None if it does learn.
         """
         self._parts, self._averaging = parts, averaging or {}
         self._learning = LearningParameters(model)
@@ -61,14 +64,16 @@ class GuardedStepper:
         # Nesting depth, for an optimizer that calls the step of its base class or of another one.
         self._depth, self._in_closure = 0, False
         self._tells = False  # whether any optimizer has ever reported a step
-        self._buffers = _BufferWatch(model)
+        self._buffers, self._rates = _BufferWatch(model), _RateWatch(why_strong)
         _AT_WORK.add(self)
         # On every optimizer of the process: that of the loop may be created after the guard.
         before, after = _hooks_of_every_optimizer(self)
-        self._hooks = [
+        self._hooks: list[Any] = [
             register_optimizer_step_pre_hook(before),
             register_optimizer_step_post_hook(after),
         ]
+        if parts.every > 1:  # otherwise no step is pending once it has ended
+            self._hooks.append(PendingWatch(model, self._stepper))
 
     def take_by_itself(self, anchor: Callable[[], Mapping[int, Tensor | None]]) -> None:
         """Constrain the steps that a loop takes by `optimizer.step()`, instead of refusing them.
@@ -190,6 +195,7 @@ class GuardedStepper:
         self._refuse_unguarded(optimizer)
         self._refuse_second(optimizer)
         self._refuse_unreached()
+        self._rates.look(self._learning.groups_of(optimizer))
         self._stepper.begin(self._learning.by_name(anchor))
         # Before the step: the shares come from the gradients that the step uses.
         slowed = SlowedStep(self._parts)
@@ -223,6 +229,12 @@ class GuardedStepper:
         self._end_broken_step()
         self._stepper.settle()
         # A model saved now may be continued by a new guard, which counts from here.
+        self._count = 0
+
+    def drop_pending(self) -> None:
+        """Forget the pending steps: the next one is the first since the present weights."""
+        self._own = None
+        self._stepper.drop_pending()
         self._count = 0
 
     def is_of_all(self, optimizer: Optimizer) -> bool:
@@ -278,6 +290,7 @@ class GuardedStepper:
         self._learning.refuse_others()
         self._refuse_unreached()
         self._refuse_second(optimizer)
+        self._rates.look(self._learning.groups_of(optimizer))
         self._stepper.begin(self._learning.by_name(self._automatic()))
         self._own = _OwnStep(SlowedStep(self._parts), self._learning.versions())
 
@@ -343,14 +356,25 @@ class GuardedStepper:
         if self._since.guarded and id(optimizer) not in self._since.stepped:
             return
         # Some libraries take a step with zero gradients to initialise an optimizer's state.
-        if any(gradient.any() for gradient in self._learning.gradients()):
-            raise AegisError(
-                "a step on guarded parameters without a guard.backward since the last one",
-                "guard.backward(loss) instead of loss.backward(), before every step",
-                "call guard.backward in the loop that trains; where a trainer calls backward "
-                "itself, guard.automatic(), or Trainer(callbacks=[guard.callback()]); "
-                "guard.remove() when done",
-            )
+        if not any(gradient.any() for gradient in self._learning.gradients()):
+            return
+        found = "a step on guarded parameters without a guard.backward since the last one"
+        for other in _AT_WORK:
+            if other is not self and (shared := other._learning.shared_with(self._learning)):
+                raise AegisError(
+                    f"{found}, of one of two guards on {len(shared)} parameters, first "
+                    f"'{shared[0]}'",
+                    "each guard sees every backward pass, and only one can be called in the loop",
+                    "guard.automatic() for one of them, or for both and a loop with "
+                    "loss.backward() and optimizer.step(); guard.remove() for one that is done",
+                )
+        raise AegisError(
+            found,
+            "guard.backward(loss) instead of loss.backward(), before every step",
+            "call guard.backward in the loop that trains; where a trainer calls backward "
+            "itself, guard.automatic(), or Trainer(callbacks=[guard.callback()]); "
+            "guard.remove() when done",
+        )
 
 
 @dataclass
@@ -430,6 +454,26 @@ class _BufferWatch:
             "module.eval() for each of these modules after model.train()",
             stacklevel=2,
         )
+
+
+class _RateWatch:
+    """Warns at the peak of the learning rate if a method is too strong for it."""
+
+    def __init__(self, why_strong: Callable[[float], str | None]) -> None:
+        self._why_strong, self._highest, self._looked = why_strong, 0.0, False
+
+    def look(self, groups: Sequence[Mapping[str, Any]]) -> None:
+        """Check the rates of a step's groups."""
+        if self._looked:
+            return
+        rate = max((float(group.get("lr", 0)) for group in groups), default=0.0)
+        # A warm-up begins far below the peak, so wait until the rate rises no further.
+        if rate > self._highest or rate == 0:
+            self._highest = max(rate, self._highest)
+            return
+        self._looked = True
+        if why := self._why_strong(self._highest):
+            warnings.warn(why, stacklevel=2)
 
 
 class SlowedStep:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from torch import nn
@@ -17,7 +18,11 @@ if TYPE_CHECKING:
 
 
 def trainer_callback(
-    guard: Guard, model: nn.Module, mask: Source, image: Source
+    guard: Guard,
+    model: nn.Module,
+    mask: Source,
+    image: Source,
+    untrained: Callable[[], bool],
 ) -> TrainerCallback:
     """A callback for the `callbacks` of a Trainer.
 
@@ -26,6 +31,7 @@ def trainer_callback(
         model: the guarded model.
         mask: as for `Guard.automatic`.
         image: as for `Guard.automatic`.
+        untrained: whether the model has exactly its pre-trained weights.
 
     Raises:
         AegisError: transformers is not installed, or only with an incompatible peft.
@@ -44,6 +50,8 @@ def trainer_callback(
 
         def on_train_begin(self, args: Any, state: Any, control: Any, **given: Any) -> None:
             _check_model(given["model"], model)
+            if state.global_step > 0:
+                _check_resumed(state.global_step, untrained())
             if not guard.is_automatic:
                 # Accelerate's optimizer knows the scaler that its loop uses.
                 scaler = getattr(given.get("optimizer"), "scaler", None)
@@ -74,4 +82,17 @@ def _check_model(trained: nn.Module, guarded: nn.Module) -> None:
             "the guarded model, or one that it is a part of",
             "give Trainer(model=...) the same model that the guard was made of; with model_init=, "
             "make the guard in it",
+        )
+
+
+def _check_resumed(step: int, untrained: bool) -> None:
+    """Raise AegisError if a Trainer resumes a training but has not loaded what it learned."""
+    if untrained:
+        raise AegisError(
+            f"a Trainer that resumes at step {step} with the pre-trained weights: it has loaded "
+            "none of the checkpoint's",
+            "the weights of the checkpoint",
+            "after Guard(...), load them yourself: model.load_state_dict("
+            "type(model).from_pretrained(checkpoint).state_dict()); then call the same "
+            "trainer.train(resume_from_checkpoint=checkpoint)",
         )

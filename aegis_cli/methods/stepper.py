@@ -113,12 +113,16 @@ class Stepper:
     def settle(self) -> None:
         """Let the method constrain the pending steps now; if there are none, nothing happens."""
         begun, update = self.pending, self._update()
-        # Cleared first, so that the step is over even if the method raises.
-        self._before, self._anchor, self._moved, self.pending = {}, {}, 0, 0
+        # Before the method, so that the step is over even if it raises.
+        self.drop_pending()
         if begun and self._parts.constrain is not None:
             # A loop may step inside an autocast of its own.
             with torch.autocast(self._device, enabled=False):
                 self._parts.constrain(update)
+
+    def drop_pending(self) -> None:
+        """Forget the pending steps, which the method then never constrains."""
+        self._before, self._anchor, self._moved, self.pending = {}, {}, 0, 0
 
     def _update(self) -> Update:
         """What the pending steps have done."""

@@ -692,14 +692,43 @@ def test_two_guards_on_a_shared_parameter_are_refused(name: str, anchors: dict[s
     task_loss(other, 0).backward()
 
 
+@pytest.mark.parametrize("by_hand", ["neither", "aegis", "nullspace"])
 def test_one_guard_of_the_gradient_and_one_of_the_update_go_together(
-    anchors: dict[str, Path],
+    by_hand: str, anchors: dict[str, Path]
 ) -> None:
-    model, guard = automatic("nullspace", anchors)
-    other = Guard(model, anchors["aegis"], LAYERS).automatic(mask="mask")
-    plain_steps(model)
-    guard.settle()
-    assert len(other.ledger) == 3
+    """Whichever of them is called in the loop, if any, the steps are the same."""
+    ends = []
+    for called in ("neither", by_hand):
+        model, second = guarded("nullspace", anchors)
+        first = Guard(model, anchors["aegis"], LAYERS)
+        for name, guard in (("aegis", first), ("nullspace", second)):
+            if name != called:
+                guard.automatic(mask="mask")
+        if called == "neither":
+            plain_steps(model)
+        else:
+            guarded_steps(model, first if called == "aegis" else second)
+        second.settle()
+        assert len(first.ledger) == 3
+        ends.append(vector(model))
+    assert torch.equal(*ends)
+    for name in ("aegis", "nullspace"):
+        alone, _ = automatic(name, anchors)
+        plain_steps(alone)
+        assert not torch.equal(ends[0], vector(alone))
+
+
+@pytest.mark.parametrize("called", ["aegis", "nullspace"])
+def test_two_guards_that_are_both_called_in_a_loop_are_named(
+    called: str, anchors: dict[str, Path]
+) -> None:
+    model, second = guarded("nullspace", anchors)
+    first = Guard(model, anchors["aegis"], LAYERS)
+    optimizer = torch.optim.SGD(model.parameters(), lr=0.1)
+    with first.watch(batch(0)[2]):
+        loss = task_loss(model, 0)
+    (first if called == "aegis" else second).backward(loss)
+    refused(lambda: second.step(optimizer), "of one of two guards on", "guard.automatic()")
 
 
 @pytest.mark.parametrize("by_itself", [True, False])

@@ -207,6 +207,7 @@ def test_the_null_space_names_what_it_cannot_hold(anchor: Path) -> None:
     )
 
 
+@pytest.mark.filterwarnings("ignore:the weight of kfac")  # strong on purpose
 def test_kfac_in_a_loop_draws_back_what_answers_mind(tmp_path: Path) -> None:
     """As in the README: normalisations and tables frozen, words drawn where labels are."""
     for_maps = (nn.Linear, nn.Conv2d)

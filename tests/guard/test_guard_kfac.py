@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -119,6 +120,19 @@ def test_what_no_answer_reads_does_not_count(tmp_path: Path) -> None:
     assert {name.rpartition(".")[0] for name in spectra[0]} == set(MAPS)
     for name, spectrum in spectra[0].items():
         torch.testing.assert_close(spectrum.values, spectra[1][name].values, rtol=1e-6, atol=1e-15)
+
+
+def test_probabilities_in_place_of_scores_are_refused() -> None:
+    """Logarithms of probabilities are scores too."""
+    for dtype in (torch.float64, torch.bfloat16):
+        model, (pixels, ids, mask) = make(), batch(0)
+        with Guard.measure(model, parts=("curvature",)) as found:
+            with found.watch(mask):
+                scores = model(pixels, ids, mask)[:, -3].to(dtype)
+            with pytest.raises(AegisError, match="that are probabilities") as caught:
+                found.answer(scores.softmax(-1))
+            assert "logits" in caught.value.expected
+            found.answer(scores.log_softmax(-1))
 
 
 class FamilyNorm(nn.Module):
@@ -284,6 +298,7 @@ def steps(model: nn.Module, guard: Guard, count: int = 4, **adam: Any) -> None:
         optimizer.zero_grad()
 
 
+@pytest.mark.filterwarnings("ignore:the weight of kfac")  # strong on purpose
 @compiling
 @pytest.mark.parametrize("build", ["plain", "compiled"])
 def test_under_a_strong_pull_nothing_is_left_of_what_answers_mind(
@@ -314,6 +329,7 @@ def test_under_a_strong_pull_nothing_is_left_of_what_answers_mind(
     torch._dynamo.reset()
 
 
+@pytest.mark.filterwarnings("ignore:the weight of kfac")  # strong on purpose
 def test_what_else_learns_is_refused_or_left_by_name(tmp_path: Path) -> None:
     path, model = measured(make(), tmp_path / "anchor.safetensors"), make()
     with pytest.raises(
@@ -407,3 +423,56 @@ def test_an_overflow_in_one_map_moves_nothing(
                 assert torch.equal(vector(each), before)
         ends.append(vector(each))
     torch.testing.assert_close(*ends, rtol=0, atol=1e-12)
+
+
+def warned(model: nn.Module, guard: Guard, rates: list[float], is_automatic: bool) -> list[int]:
+    """The steps, from 0, at which a guard warns of its weight; the other half learns faster."""
+    learning = [p for p in model.parameters() if p.requires_grad]
+    expert = nn.Parameter(torch.ones(1))
+    groups = [{"params": learning}, {"params": [expert], "lr": 1.0}]
+    optimizer = torch.optim.SGD(groups, lr=0.0)
+    if is_automatic:
+        guard.automatic()
+    found = []
+    for step, rate in enumerate(rates):
+        optimizer.param_groups[0]["lr"] = rate
+        loss = task_loss(model, step)
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always")
+            if is_automatic:
+                loss.backward()
+                optimizer.step()
+            else:
+                guard.backward(loss)
+                guard.step(optimizer)
+        optimizer.zero_grad()
+        if said:
+            (text,) = (str(warning.message) for warning in said)
+            assert "the guard's option weight=" in text and "may learn little" in text
+            found.append(step)
+    return found
+
+
+@pytest.mark.parametrize("is_automatic", [False, True])
+def test_a_guard_warns_once_of_a_weight_too_strong_for_the_learning_rate(
+    is_automatic: bool, tmp_path: Path
+) -> None:
+    """At the end of a warm-up, and by the rate of what it guards."""
+    path = measured(make(), tmp_path / "anchor.safetensors")
+    for rates, expected in (
+        ([1e-5] * 3, [1]),  # the default weight is 3,000 times the rate
+        ([0.0, 1e-6, 2e-6, 2e-6, 1e-6], [3]),
+        ([1e-6, 1e-4, 2e-3, 2e-3, 1e-6], []),  # 15 times the peak
+        ([0.0] * 3, []),
+    ):
+        model = only_maps(make())
+        guard = Guard(model, path, method="kfac")
+        assert warned(model, guard, rates, is_automatic) == expected
+        guard.remove()
+
+
+def test_a_weight_of_15_times_the_rate_is_not_too_strong(tmp_path: Path) -> None:
+    path = measured(make(), tmp_path / "anchor.safetensors")
+    model = only_maps(make())
+    guard = Guard(model, path, method="kfac", weight=15 * 1e-5)
+    assert warned(model, guard, [1e-5] * 3, is_automatic=False) == []

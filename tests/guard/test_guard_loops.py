@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import sys
 import types
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -173,6 +174,48 @@ def test_a_trainer_settles_before_it_evaluates(
     given.evaluate = lambda *a, **k: (pending.append(guard.pending), evaluate(*a, **k))[1]
     given.train()
     assert pending == [0] * times
+
+
+def test_a_trainer_saves_settled_weights(guarded: Guarded, tmp_path: Path) -> None:
+    """So the guard does not warn that the state is taken while steps are pending."""
+    model, guard = guarded("nullspace")  # it constrains every second step; three are taken
+    given = trainer(model, tmp_path, [guard.callback()], save_strategy="steps", save_steps=1)
+    saved = []
+
+    def save(folder: str, **_: Any) -> None:
+        """In place of safetensors, which refuses the tied head of this model."""
+        Path(folder).mkdir()
+        saved.append(given.model.state_dict())
+
+    given.save_model = save
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        given.train()
+    assert [str(w.message) for w in said if "pending" in str(w.message)] == []
+    assert len(saved) == STEPS
+
+
+@pytest.mark.parametrize("loads", [True, False])
+def test_a_trainer_that_resumes_without_the_learned_weights_is_refused(
+    loads: bool, guarded: Guarded, tmp_path: Path
+) -> None:
+    """As one does whose names in the file are not those of the model, which it only warns of."""
+    model, guard = guarded("nullspace")
+    given = trainer(model, tmp_path, [guard.callback()], save_strategy="steps", save_steps=1)
+    given.save_model = lambda folder, **_: Path(folder).mkdir()
+    given.train()
+    other, its = guarded("nullspace")
+    given = trainer(other, tmp_path, [its.callback()], num_train_epochs=2)
+    given._load_from_checkpoint = lambda *_: other.load_state_dict(
+        model.state_dict() if loads else {}, strict=loads
+    )
+    checkpoint = str(tmp_path / f"checkpoint-{STEPS}")
+    if loads:
+        given.train(resume_from_checkpoint=checkpoint)
+        assert given.state.global_step == 2 * STEPS
+        return
+    with pytest.raises(AegisError, match=f"resumes at step {STEPS} with the pre-trained weights"):
+        given.train(resume_from_checkpoint=checkpoint)
 
 
 @every_method

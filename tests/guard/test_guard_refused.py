@@ -547,7 +547,9 @@ def test_a_map_that_reads_one_row_a_text(keep: bool) -> None:
 def test_a_compiled_model_is_measured_before() -> None:
     model = make()
     model.text.norm._orig_mod = model.text.norm.forward  # what torch.compile's wrapper has
-    refused(lambda: Guard.measure(model, LAYERS), "text.norm", "torch.compile")
+    refused(lambda: Guard.measure(model, LAYERS), "'text.norm' under torch.compile")
+    whole = torch.compile(make(), backend="eager")
+    refused(lambda: Guard.measure(whole, LAYERS), "the model itself under torch.compile")
 
 
 # --- hints ----------------------------------------------------------------------------------------

@@ -139,13 +139,24 @@ def test_nullspace_protects_adapters_that_were_measured(
     path = measured(with_lora(make()).eval(), tmp_path / "anchor.safetensors")
     other = with_lora(make())
     nn.init.ones_(other.get_submodule("base_model.model.text.layers.0.up.lora_A.default").weight)
-    with pytest.raises(AegisError, match="measured without these adapters"):
+    with pytest.raises(AegisError, match="measured with adapters of other values") as caught:
         Guard(other, path, **options)
+    assert "save_pretrained" in caught.value.fix
     model = with_lora(make())
     before = adapters(model)
     guard = Guard(model, path, **options)
     guarded_steps(model, guard, steps=1)
     assert not torch.equal(adapters(model), before)
+
+
+def test_adapters_that_were_saved_are_those_that_were_measured(tmp_path: Path) -> None:
+    """So one process may measure and another one train."""
+    peft = pytest.importorskip("peft")
+    model = with_lora(make()).eval()
+    model.save_pretrained(tmp_path / "adapters")
+    path = measured(model, tmp_path / "anchor.safetensors")
+    other = peft.PeftModel.from_pretrained(make(), tmp_path / "adapters", is_trainable=True)
+    Guard(other, path, method="nullspace", vision="vision", energy=1.0)
 
 
 # --- other wrappers -------------------------------------------------------------------------------
