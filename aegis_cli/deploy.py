@@ -30,7 +30,7 @@ import torch
 from aegis_cli.common import devices
 from aegis_cli.common.errors import AegisError, in_short
 from aegis_cli.common.pictures import fit
-from aegis_cli.continual import robots
+from aegis_cli.continual import places, robots
 from aegis_cli.core import ensemble as temporal
 from aegis_cli.core.continuation import Continued
 from aegis_cli.core.ensemble import TemporalEnsemble
@@ -444,6 +444,7 @@ def load_policy(
     seed: int = 0,
     precision: str = devices.AUTO,
     ensemble: float | None = None,
+    backbone: str | None = None,
 ) -> DeployedPolicy:
     """Load the policy of a run, on the GPU if there is one.
 
@@ -456,6 +457,7 @@ def load_policy(
             in training. The returned actions are float32.
         ensemble: decay of a temporal ensemble; None: the setting that the policy was trained with,
             which is no ensemble unless its recipe has `rollout.ensemble`.
+        backbone: the new place of the backbone of a stream of robot tasks, if it has moved.
 
     Raises:
         AegisError: there is no run, files are missing, broken or from different checkpoints, the
@@ -466,7 +468,9 @@ def load_policy(
     folder, device = Path(run), devices.pick()
     acts_in = devices.acting_precision(device, precision)
     if is_robot_stream_run(folder):
-        return _of_stream(folder, task, device, acts_in, seed, ensemble)
+        return _of_stream(folder, task, device, acts_in, seed, ensemble, backbone)
+    if backbone is not None:
+        raise places.refuse(folder)
     policy, meta = checkpoint.load_policy(folder)
     checkpoint.check_task(meta, task)
     policy.acts_in = acts_in
@@ -489,10 +493,11 @@ def _of_stream(
     acts_in: str,
     seed: int,
     ensemble: float | None,
+    backbone: str | None,
 ) -> DeployedPolicy:
     """The policy of one task of a stream."""
     number = robots.number_of(folder, task)
-    run = robots.load_to_act(folder)
+    run = robots.load_to_act(folder, backbone)
     policy = run.policies[number]
     policy.acts_in = acts_in
     view, normalization = run.views[number], run.recipe.train.normalization
@@ -514,11 +519,17 @@ def _of_stream(
     )
 
 
-def load_acting(run: Path, task: str | None) -> Acting:
+def load_acting(run: Path, task: str | None, backbone: str | None = None) -> Acting:
     """Load what `aegis rollout` runs: the policy of a training run, or of one task of a stream.
+
+    Args:
+        backbone: as in `load_policy`.
 
     Raises:
         AegisError: there is no such run, or it has not learned the task.
     """
-    load = robots.load_policy if is_robot_stream_run(run) else load_run
-    return load(run, task)
+    if is_robot_stream_run(run):
+        return robots.load_policy(run, task, backbone)
+    if backbone is not None:
+        raise places.refuse(run)
+    return load_run(run, task)

@@ -9,7 +9,7 @@ from typing import Any
 from aegis_cli.common import commands, launch
 from aegis_cli.common.errors import AegisError
 from aegis_cli.data.selection import Paths
-from aegis_cli.recipes import Recipe
+from aegis_cli.recipes import Recipe, RobotStreamRecipe
 
 RECIPE = "recipe.yaml"
 
@@ -38,8 +38,11 @@ def recipe_of(run: Path, out: Path | None) -> Path:
 
 def _given(run: Path) -> list[str]:
     """What a run was given beside its recipe, as options; nothing where it does not say."""
+    from aegis_cli.recipes import is_stream_run
     from aegis_cli.training import inputs
 
+    if is_stream_run(run):  # its recipe names what it reads
+        return []
     kept = inputs.of(run)
     if kept is None:
         return []
@@ -234,6 +237,12 @@ def command(
             return None
         # If the run was extended, the recipe on disk is not this one.
         recipe = longer.plan(out, recipe)
+    if isinstance(recipe, RobotStreamRecipe):
+        from aegis_cli.continual import places
+
+        if not places.is_kept(out, recipe):
+            return None
+        recipe = places.as_begun(out, recipe)
     return ["train", str(out), *options] if folder.goes_on(out, recipe) else None
 
 

@@ -104,11 +104,15 @@ def goes_on(out: Path, recipe: Trained) -> bool:
 def continues(out: Path, recipe: Trained) -> bool:
     """Whether a run may be resumed with `recipe`.
 
-    Its backbone may have another path there: the checkpoints of a policy's run hold the backbone's
-    digest, which is compared later. Keys of `recipes.adjustable` may have other values.
+    Its backbone may have another path there: the checkpoints of a policy's run, and the state of a
+    stream of robot tasks, hold the backbone's digest, which is compared later.
+    Keys of `recipes.adjustable` may have other values.
     """
     begun = _begun(out, recipe)
-    if isinstance(begun, Recipe) and isinstance(recipe, Recipe) and checkpoint.begun(out):
+    of_policy = isinstance(begun, Recipe) and checkpoint.begun(out)
+    of_stream = isinstance(begun, RobotStreamRecipe) and is_learning(out)
+    if (of_policy or of_stream) and not isinstance(recipe, StreamRecipe):
+        assert not isinstance(begun, StreamRecipe)
         # A backbone is PATH#LAYERS. Only the path may differ: other layers of one model have the
         # same weights and the same digest, but train differently.
         _, layers_there = backbones.divided(begun.backbone)
@@ -116,6 +120,11 @@ def continues(out: Path, recipe: Trained) -> bool:
         if layers_there == layers_here:
             begun = dataclasses.replace(begun, backbone=recipe.backbone)
     return recipes.training_part(_adjusted(begun, recipe)) == recipes.training_part(recipe)
+
+
+def is_learning(out: Path) -> bool:
+    """Whether a stream of robot tasks in `out` has files with the digest of its backbone."""
+    return any((out / name).is_file() for name in ("state.safetensors", "expert.safetensors"))
 
 
 def _adjusted(recipe: T, like: T) -> T:
