@@ -443,7 +443,10 @@ def train(
             )
             _gate(dry_run_of.module.shortage(report))
             return
-        ctx.meta[GOES_ON] = partial(resuming.command, resolved, out, None, None, as_they_are)
+        more = out, None, None, as_they_are
+        ctx.meta[GOES_ON] = partial(resuming.command, resolved, *more)
+        if isinstance(resolved, RobotStreamRecipe):
+            ctx.meta[LIGHTER] = partial(resuming.lighter, resolved, *more)
         stages.TRAIN[type(resolved)].run(
             resolved, out, resume=resume, overwrite=overwrite, device=device, as_json=as_json
         )

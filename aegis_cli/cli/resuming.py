@@ -247,12 +247,16 @@ def command(
 
 
 def lighter(
-    recipe: Recipe, out: Path, demos: Paths, anchor: Path | None, options: Sequence[str]
+    recipe: Recipe | RobotStreamRecipe,
+    out: Path,
+    demos: Paths | None,
+    anchor: Path | None,
+    options: Sequence[str],
 ) -> list[list[str]]:
-    """The words of the commands that resume a policy's run with less memory per step.
+    """The words of the commands that resume a run with less memory per step.
 
-    What it learns stays the same but for rounding. There is none if `command` finds none, or if
-    nothing is left to save memory with.
+    What it learns stays the same but for rounding (see `recipes.adjustable`). There is none if
+    `command` finds none, or if nothing is left to save memory with.
 
     Args:
         options: as for `command`.
@@ -264,7 +268,8 @@ def lighter(
         return []
     settings, found = recipe.train, list[list[str]]()
     if not settings.gradient_checkpointing and _is_of_hugging_face(recipe.backbone):
-        off = ["train.compile=false"] if settings.compile else []  # one of the two
+        compiled = isinstance(recipe, Recipe) and recipe.train.compile
+        off = ["train.compile=false"] if compiled else []  # one of the two
         found.append(["train.gradient_checkpointing=true", *off])
     passes = 2 * settings.accumulate
     fits = passes * launch.world_size() <= settings.batch_size

@@ -28,7 +28,7 @@ import torch
 from aegis_cli import recipes
 from aegis_cli.common import devices, launch, locks
 from aegis_cli.common.errors import AegisError
-from aegis_cli.common.events import OnEvent, Progress, ignore
+from aegis_cli.common.events import OnEvent, Progress, Warned, ignore
 from aegis_cli.common.files import canonical, write_text
 from aegis_cli.continual import files, images, loop, more_tasks, places, state
 from aegis_cli.continual.report import StreamReport
@@ -85,6 +85,8 @@ def _run(
     optimizer = None
     if (out / state.STATE).exists():
         optimizer = state.restore(built)
+        if not adds:
+            _adjust(built, optimizer, on_event)
         _truncate_metrics(built)
         _keep_places(out, here)
     else:  # also a run that was interrupted before its first state
@@ -111,6 +113,23 @@ def _located(
     if not isinstance(recipe, RobotStreamRecipe) or not resume:
         return recipe, recipe
     return places.as_begun(out, recipe), places.to_learn(out, recipe)
+
+
+def _adjust(run: AnyStreamRun, optimizer: torch.optim.Optimizer | None, on_event: OnEvent) -> None:
+    """Say and write which settings a resumed run takes that it did not have so far."""
+    recipe = run.recipe
+    if not isinstance(recipe, RobotStreamRecipe):
+        return
+    if changes := folder.adjustments(run.out, recipe):
+        text = (
+            f"'{run.out}' goes on with {changes}. This changes memory, time or what is written, "
+            "and what is learned at most by rounding (with igsp and train.accumulate also a little "
+            "where instructions have several lengths); files may differ from those of an "
+            "uninterrupted run"
+        )
+        on_event(Warned("train", text))
+        state.save(run, optimizer)  # first, as it can be resumed with either recipe
+        folder.write_recipe(run.out, recipe)
 
 
 def _keep_places(out: Path, here: StreamRecipe | RobotStreamRecipe) -> None:

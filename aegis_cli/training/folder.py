@@ -129,19 +129,19 @@ def is_learning(out: Path) -> bool:
 
 def _adjusted(recipe: T, like: T) -> T:
     """The recipe with another's values of the keys that may change when a run is resumed."""
-    if not isinstance(recipe, Recipe) or not isinstance(like, Recipe):
-        return recipe  # a stream's may not
+    if isinstance(recipe, StreamRecipe) or isinstance(like, StreamRecipe):
+        return recipe  # a stream of images has none
     names = recipes.adjustable(recipe) & recipes.adjustable(like)
     values = {name: getattr(like.train, name) for name in names}
     return dataclasses.replace(recipe, train=dataclasses.replace(recipe.train, **values))
 
 
-def as_begun(out: Path, recipe: Recipe) -> Recipe:
+def as_begun(out: Path, recipe: T) -> T:
     """The recipe with the run's values of the keys that may change when it is resumed."""
-    return _adjusted(recipe, recipes.load(out / "recipe.yaml", kind=Recipe))
+    return _adjusted(recipe, recipes.load(out / "recipe.yaml", kind=type(recipe)))
 
 
-def adjustments(out: Path, recipe: Recipe) -> str:
+def adjustments(out: Path, recipe: Recipe | RobotStreamRecipe) -> str:
     """The keys of `recipe` that change when the run is resumed with it; empty if none does."""
     there, here = as_begun(out, recipe).train, recipe.train
     names = {n for n in recipes.adjustable(recipe) if f"train.{n}" not in recipes.retired()}
