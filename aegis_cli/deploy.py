@@ -68,6 +68,7 @@ class DeployedPolicy:
 
     Attributes:
         task: the task that it was trained on; None for a dataset of no simulated task.
+        in_stream: the name that a stream gives such a task; None outside a stream.
         cameras: names of the pictures that it takes, in order; empty for a single unnamed picture.
         sizes: (height, width) of the pictures that it was trained on, one per camera; empty if
             unknown, or if the backbone reads squares of `image_size`.
@@ -93,6 +94,7 @@ class DeployedPolicy:
         sizes: Sequence[tuple[int, int]] = (),
         recorded: Mapping[str, Any] | None = None,
         ensemble: float | None = None,
+        in_stream: str | None = None,
     ) -> None:
         """Begin the first episode.
 
@@ -101,9 +103,11 @@ class DeployedPolicy:
                 `proprio_names`, `state`, `fps`, `normalization` and `proprio_reach`, each only if
                 it is known.
             ensemble: decay of a temporal ensemble; `replan` is then always 1.
+            in_stream: see the attribute.
         """
         self._policy, self._generator = policy, torch.Generator()
         self.task, self.cameras, self._seed = task, tuple(cameras), seed
+        self.in_stream = in_stream
         self.ensemble, self.replan = ensemble, replan if ensemble is None else 1
         self.sizes = tuple(sizes)
         self.positions, self.actions = len(policy.proprio_scale.mean), len(policy.action_scale.mean)
@@ -515,7 +519,15 @@ def _of_stream(
     sizes = checkpoint.sizes_of(view)
     known = {**view, "normalization": normalization}
     return DeployedPolicy(
-        policy.eval().to(device), None, cameras, replan, seed, sizes, known, ensemble
+        policy.eval().to(device),
+        None,
+        cameras,
+        replan,
+        seed,
+        sizes,
+        known,
+        ensemble,
+        in_stream=run.names[number],
     )
 
 

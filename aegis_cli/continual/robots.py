@@ -583,7 +583,7 @@ def number_of(path: Path, task: str | None) -> int:
         raise AegisError(
             f"{named} for the stream in '{path}'",
             f"one of its tasks: {', '.join(known)}",
-            f"--task {known[0]}",
+            f"--task {known[0]}; in Python, task={known[0]!r}",
         )
     return known.index(task)
 
