@@ -30,7 +30,7 @@ import torch
 from aegis_cli.common import devices
 from aegis_cli.common.errors import AegisError, in_short
 from aegis_cli.common.pictures import fit
-from aegis_cli.continual import robots
+from aegis_cli.continual import places, robots
 from aegis_cli.core import ensemble as temporal
 from aegis_cli.core.continuation import Continued
 from aegis_cli.core.ensemble import TemporalEnsemble
@@ -68,6 +68,7 @@ class DeployedPolicy:
 
     Attributes:
         task: the task that it was trained on; None for a dataset of no simulated task.
+        in_stream: the name that a stream gives such a task; None outside a stream.
         cameras: names of the pictures that it takes, in order; empty for a single unnamed picture.
         sizes: (height, width) of the pictures that it was trained on, one per camera; empty if
             unknown, or if the backbone reads squares of `image_size`.
@@ -93,6 +94,7 @@ class DeployedPolicy:
         sizes: Sequence[tuple[int, int]] = (),
         recorded: Mapping[str, Any] | None = None,
         ensemble: float | None = None,
+        in_stream: str | None = None,
     ) -> None:
         """Begin the first episode.
 
@@ -101,9 +103,11 @@ class DeployedPolicy:
                 `proprio_names`, `state`, `fps`, `normalization` and `proprio_reach`, each only if
                 it is known.
             ensemble: decay of a temporal ensemble; `replan` is then always 1.
+            in_stream: see the attribute.
         """
         self._policy, self._generator = policy, torch.Generator()
         self.task, self.cameras, self._seed = task, tuple(cameras), seed
+        self.in_stream = in_stream
         self.ensemble, self.replan = ensemble, replan if ensemble is None else 1
         self.sizes = tuple(sizes)
         self.positions, self.actions = len(policy.proprio_scale.mean), len(policy.action_scale.mean)
@@ -446,6 +450,7 @@ def load_policy(
     seed: int = 0,
     precision: str = devices.AUTO,
     ensemble: float | None = None,
+    backbone: str | None = None,
 ) -> DeployedPolicy:
     """Load the policy of a run, on the GPU if there is one.
 
@@ -458,6 +463,7 @@ def load_policy(
             in training. The returned actions are float32.
         ensemble: decay of a temporal ensemble; None: the setting that the policy was trained with,
             which is no ensemble unless its recipe has `rollout.ensemble`.
+        backbone: the new place of the backbone of a stream of robot tasks, if it has moved.
 
     Raises:
         AegisError: there is no run, files are missing, broken or from different checkpoints, the
@@ -468,7 +474,9 @@ def load_policy(
     folder, device = Path(run), devices.pick()
     acts_in = devices.acting_precision(device, precision)
     if is_robot_stream_run(folder):
-        return _of_stream(folder, task, device, acts_in, seed, ensemble)
+        return _of_stream(folder, task, device, acts_in, seed, ensemble, backbone)
+    if backbone is not None:
+        raise places.refuse(folder)
     policy, meta = checkpoint.load_policy(folder)
     checkpoint.check_task(meta, task)
     policy.acts_in = acts_in
@@ -491,10 +499,11 @@ def _of_stream(
     acts_in: str,
     seed: int,
     ensemble: float | None,
+    backbone: str | None,
 ) -> DeployedPolicy:
     """The policy of one task of a stream."""
     number = robots.number_of(folder, task)
-    run = robots.load_to_act(folder)
+    run = robots.load_to_act(folder, backbone)
     policy = run.policies[number]
     policy.acts_in = acts_in
     view, normalization = run.views[number], run.recipe.train.normalization
@@ -514,15 +523,29 @@ def _of_stream(
     sizes = checkpoint.sizes_of(view)
     known = {**view, "normalization": normalization}
     return DeployedPolicy(
-        policy.eval().to(device), None, cameras, settings.replan, seed, sizes, known, decay
+        policy.eval().to(device),
+        None,
+        cameras,
+        settings.replan,
+        seed,
+        sizes,
+        known,
+        decay,
+        in_stream=run.names[number],
     )
 
 
-def load_acting(run: Path, task: str | None) -> Acting:
+def load_acting(run: Path, task: str | None, backbone: str | None = None) -> Acting:
     """Load what `aegis rollout` runs: the policy of a training run, or of one task of a stream.
+
+    Args:
+        backbone: as in `load_policy`.
 
     Raises:
         AegisError: there is no such run, or it has not learned the task.
     """
-    load = robots.load_policy if is_robot_stream_run(run) else load_run
-    return load(run, task)
+    if is_robot_stream_run(run):
+        return robots.load_policy(run, task, backbone)
+    if backbone is not None:
+        raise places.refuse(run)
+    return load_run(run, task)

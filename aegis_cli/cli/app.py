@@ -43,6 +43,7 @@ from aegis_cli.cli.options import (
     Format,
     Gate,
     Json,
+    MovedBackbone,
     OfStream,
     Overwrite,
     OwnAsk,
@@ -444,7 +445,10 @@ def train(
             )
             _gate(dry_run_of.module.shortage(report))
             return
-        ctx.meta[GOES_ON] = partial(resuming.command, resolved, out, None, None, as_they_are)
+        more = out, None, None, as_they_are
+        ctx.meta[GOES_ON] = partial(resuming.command, resolved, *more)
+        if isinstance(resolved, RobotStreamRecipe):
+            ctx.meta[LIGHTER] = partial(resuming.lighter, resolved, *more)
         stages.TRAIN[type(resolved)].run(
             resolved, out, resume=resume, overwrite=overwrite, device=device, as_json=as_json
         )
@@ -765,6 +769,16 @@ def probe(
         ),
     ] = None,
     batch_size: OwnBatchSize = None,
+    backbone: MovedBackbone = None,
+    demos: Annotated[
+        list[Path] | None,
+        Option(
+            parser=demonstrations_path,
+            metavar="PATH",
+            help="New place of the demonstrations of a stream's task without a simulator, one for "
+            "each task in their order; default: where the stream found them.",
+        ),
+    ] = None,
     device: Device = None,
     as_json: Json = False,
 ) -> None:
@@ -778,10 +792,17 @@ def probe(
     Example: aegis probe runs/x --max-drop 1 --gate upper
     """
     if is_stream_run(Path(target)):
-        options = [name for name in given(ctx) if name not in ("--json", "--device")]
+        own = {"--json", "--device"}
+        if is_robot_stream_run(Path(target)):
+            own |= set(_OF_ROBOT_STREAMS)
+        options = [name for name in given(ctx) if name not in own]
         stages.refuse_options(options, f"in '{target}'")
-        stages.PROBE_STREAM.run(Path(target), device=device, as_json=as_json)
+        moved = {"backbone": backbone, "demos": demos or []}
+        stages.PROBE_STREAM.run(Path(target), device=device, as_json=as_json, **moved)
         return
+    if unused := [name for name in _OF_ROBOT_STREAMS if name in given(ctx)]:
+        found = f"{', '.join(unused)} with '{target}', which is no stream of robot tasks"
+        raise AegisError(found, "no such option here", f"leave out {', '.join(unused)}")
     asks = question_sets.chosen(target, vqa, ask, skip_bad, batch_size, questions, seed)
     limit, is_default = "--max-drop", baseline is None
     if max_drop is None and asks.max_drop is not None and baseline != _NO_BASELINE:
@@ -818,6 +839,7 @@ def probe(
     _end_at_gate(failed)
 
 
+_OF_ROBOT_STREAMS = ("--backbone", "--demos")  # options of `probe`
 _NO_BASELINE = "none"  # as --baseline
 
 
@@ -1064,6 +1086,7 @@ def rollout(
         Option("--guided", help="With --delay: each chunk continues the previous one."),
     ] = False,
     video: Annotated[Path | None, Option(metavar="FILE", help="Also write a .mp4 or .gif.")] = None,
+    backbone: MovedBackbone = None,
     device: Device = None,
     as_json: Json = False,
 ) -> None:
@@ -1091,7 +1114,8 @@ def rollout(
         episodes,
         colors.value,
         video,
-        load=load_acting,  # passed in, since `evaluation` may not import `deploy`
+        # Passed in, since `evaluation` may not import `deploy`.
+        load=partial(load_acting, backbone=backbone),
         seed=seed,
         keep=True,
         ensemble=ensemble,
@@ -1134,6 +1158,7 @@ def evaluate(
         Path | None,
         Option(metavar="FILE", help="Also draw predicted against recorded actions: .png or .pdf."),
     ] = None,
+    backbone: MovedBackbone = None,
     device: Device = None,
     as_json: Json = False,
 ) -> None:
@@ -1157,8 +1182,14 @@ def evaluate(
     asked: list[Any] = [chosen, frames, seed, batch_size, plot is not None]
     options: dict[str, Any] = {"rename": renaming(rename), "device": device, "as_json": as_json}
     if is_robot_stream_run(run):
-        report = stages.EVALUATE_STREAM.run(run, task, demos, *asked, **options)
+        report = stages.EVALUATE_STREAM.run(run, task, demos, *asked, backbone=backbone, **options)
     else:
+        if backbone is not None:
+            raise AegisError(
+                f"--backbone with '{run}', which is no stream of robot tasks",
+                "no such option: a policy's run holds its backbone",
+                "leave out --backbone",
+            )
         learned = demos or resuming.demonstrations_of(run)
         report = stages.EVALUATE.run(run, learned, *asked, keep=True, task=task, **options)
     _warn_of(report)
@@ -1192,6 +1223,7 @@ def serve(
         Option(help="Number format of matrix products; auto is bf16 on a GPU that has it."),
     ] = Precision.auto,
     ensemble: Ensemble = None,
+    backbone: MovedBackbone = None,
     device: Device = None,
     as_json: Json = False,
 ) -> None:
@@ -1219,7 +1251,8 @@ def serve(
 
     # Not a `Stage`, which shows its report at its end: a server shows it at its start.
     with stages.computing_on(device):
-        server.run(run, task, host, port, prompt, seed, precision, listening, ensemble, render.note)
+        given_to = run, task, host, port, prompt, seed, precision, listening, ensemble, render.note
+        server.run(*given_to, backbone=backbone)
 
 
 @app.command(short_help="Write a trained policy for others, or for LeRobot.")
@@ -1240,6 +1273,7 @@ def export(
             "top.",
         ),
     ] = None,
+    backbone: MovedBackbone = None,
     as_json: Json = False,
 ) -> None:
     """Write a trained policy as a folder in LeRobot's layout, or as a checkpoint to use.
@@ -1259,7 +1293,16 @@ def export(
     Example: aegis export runs/x --format aegis --dtype bfloat16 --out policies/x
     Example: aegis export runs/bench --task open-drawer --out policies/drawer
     """
-    stages.EXPORT.run(run, out, form.value, camera, dtype=dtype.value, task=task, as_json=as_json)
+    stages.EXPORT.run(
+        run,
+        out,
+        form.value,
+        camera,
+        dtype=dtype.value,
+        task=task,
+        backbone=backbone,
+        as_json=as_json,
+    )
 
 
 @app.command(short_help="Send a trained policy to the Hugging Face hub.")

@@ -393,4 +393,13 @@ OfStream = Annotated[
     str | None,
     Option("--task", metavar="NAME", help="Which policy, if RUN is a stream of robot tasks."),
 ]
+MovedBackbone = Annotated[
+    str | None,
+    Option(
+        "--backbone",
+        metavar="MODEL",
+        help="New place of the backbone that a stream of robot tasks was learned with, if it has "
+        "moved.",
+    ),
+]
 AnchorIn = Annotated[Path | None, Option(metavar="FILE", help="Anchor file of the backbone.")]

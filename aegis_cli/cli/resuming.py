@@ -9,7 +9,7 @@ from typing import Any
 from aegis_cli.common import commands, launch
 from aegis_cli.common.errors import AegisError
 from aegis_cli.data.selection import Paths
-from aegis_cli.recipes import Recipe
+from aegis_cli.recipes import Recipe, RobotStreamRecipe
 
 RECIPE = "recipe.yaml"
 
@@ -38,8 +38,11 @@ def recipe_of(run: Path, out: Path | None) -> Path:
 
 def _given(run: Path) -> list[str]:
     """What a run was given beside its recipe, as options; nothing where it does not say."""
+    from aegis_cli.recipes import is_stream_run
     from aegis_cli.training import inputs
 
+    if is_stream_run(run):  # its recipe names what it reads
+        return []
     kept = inputs.of(run)
     if kept is None:
         return []
@@ -234,16 +237,26 @@ def command(
             return None
         # If the run was extended, the recipe on disk is not this one.
         recipe = longer.plan(out, recipe)
+    if isinstance(recipe, RobotStreamRecipe):
+        from aegis_cli.continual import places
+
+        if not places.is_kept(out, recipe):
+            return None
+        recipe = places.as_begun(out, recipe)
     return ["train", str(out), *options] if folder.goes_on(out, recipe) else None
 
 
 def lighter(
-    recipe: Recipe, out: Path, demos: Paths, anchor: Path | None, options: Sequence[str]
+    recipe: Recipe | RobotStreamRecipe,
+    out: Path,
+    demos: Paths | None,
+    anchor: Path | None,
+    options: Sequence[str],
 ) -> list[list[str]]:
-    """The words of the commands that resume a policy's run with less memory per step.
+    """The words of the commands that resume a run with less memory per step.
 
-    What it learns stays the same but for rounding. There is none if `command` finds none, or if
-    nothing is left to save memory with.
+    What it learns stays the same but for rounding (see `recipes.adjustable`). There is none if
+    `command` finds none, or if nothing is left to save memory with.
 
     Args:
         options: as for `command`.
@@ -255,7 +268,8 @@ def lighter(
         return []
     settings, found = recipe.train, list[list[str]]()
     if not settings.gradient_checkpointing and _is_of_hugging_face(recipe.backbone):
-        off = ["train.compile=false"] if settings.compile else []  # one of the two
+        compiled = isinstance(recipe, Recipe) and recipe.train.compile
+        off = ["train.compile=false"] if compiled else []  # one of the two
         found.append(["train.gradient_checkpointing=true", *off])
     passes = 2 * settings.accumulate
     fits = passes * launch.world_size() <= settings.batch_size

@@ -19,7 +19,16 @@ from aegis_cli.common import commands, devices, launch, memory, prefetch
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Progress, ignore, loading_told
 from aegis_cli.common.ranks import ALONE
-from aegis_cli.continual import files, loop, more_tasks, robot_demos, robots, state, train
+from aegis_cli.continual import (
+    files,
+    loop,
+    more_tasks,
+    places,
+    robot_demos,
+    robots,
+    state,
+    train,
+)
 from aegis_cli.continual.loop import TaskTraining
 from aegis_cli.continual.robots import RobotStreamRun
 from aegis_cli.continual.state import TaskInProgress
@@ -131,6 +140,8 @@ def _run(
 ) -> StreamDryRunReport:
     device = devices.pick()
     more_tasks.check(out, recipe, resume, overwrite, train.read_by(recipe))
+    if resume and not overwrite:
+        recipe = places.to_learn(out, recipe)
     recipe = _recorded(recipe, out)
     # Measured before this process allocates any.
     free, base = memory.free(device), memory.restart_peak(device)

@@ -10,7 +10,7 @@ from aegis_cli import recipes
 from aegis_cli.common import commands, hub
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, ignore, loading_told
-from aegis_cli.continual import files, learners, robot_demos, robots
+from aegis_cli.continual import files, learners, places, robot_demos, robots
 from aegis_cli.continual.robots import RobotStreamRun
 from aegis_cli.data.renaming import Renaming
 from aegis_cli.evaluation import open_loop
@@ -41,6 +41,7 @@ def run(
     traced: bool = False,
     on_event: OnEvent = ignore,
     rename: Renaming = (),
+    backbone: str | None = None,
 ) -> TaskOpenLoopReport:
     """Compare the predictions of one of a stream's policies with demonstrations, frame by frame.
 
@@ -50,6 +51,7 @@ def run(
         episodes: numbers from 0; None means the task's held-out episodes, or all episodes of other
             data.
         frames, seed, batch_size, traced, rename: as in `open_loop.run`.
+        backbone: the new place of the stream's backbone, if it has moved.
 
     Raises:
         AegisError: the run has not learned the task, or `open_loop.run` raises.
@@ -57,9 +59,9 @@ def run(
     number = robots.number_of(run_path, task)
     recipe = recipes.load(run_path / "recipe.yaml", kind=RobotStreamRecipe)
     if data is None:
-        data = _own(recipe, number, run_path)
+        data = _own(places.here(run_path, recipe, recipe.backbone), number, run_path)
     with loading_told("evaluate", on_event):
-        stream = robots.load_to_act(run_path)
+        stream = robots.load_to_act(run_path, backbone)
     stream.activate(number)
     source = _source(stream, number, data)
     earlier = [*_of_other_tasks(stream, number, data), *source.before()]

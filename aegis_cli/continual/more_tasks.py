@@ -73,6 +73,7 @@ def begin(run: AnyStreamRun, on_event: OnEvent) -> None:
     report = files.read(run.out)
     learned = _of_first(run.recipe, len(report.tasks))
     _check_inputs(run, report)
+    changes = folder.adjustments(run.out, run.recipe)
     robots.take_over(run, learned)
     run.current = _place_after(report)
     state.save(run, None)
@@ -80,6 +81,8 @@ def begin(run: AnyStreamRun, on_event: OnEvent) -> None:
     folder.write_recipe(run.out, run.recipe)
     (run.out / files.REPORT).unlink()
     new = ", ".join(run.names[len(report.tasks) :])
+    if changes:
+        new += f" and {changes}"
     text = f"'{run.out}' goes on with {new}; until it is finished, it cannot be used"
     on_event(Warned("train", text))
 

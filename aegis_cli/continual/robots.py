@@ -25,7 +25,7 @@ from aegis_cli.common.errors import AegisError, check_finite
 from aegis_cli.common.events import OnEvent, Progress, Warned, ignore
 from aegis_cli.common.ranks import ALONE
 from aegis_cli.common.state_dicts import check_state, outline, reading_meta, shape_from
-from aegis_cli.continual import files, learners, robot_demos
+from aegis_cli.continual import files, learners, places, robot_demos
 from aegis_cli.continual.report import (
     Ends,
     ErrorMatrix,
@@ -371,18 +371,29 @@ def build(recipe: RobotStreamRecipe, out: Path, on_event: OnEvent = ignore) -> R
 
 
 def load(
-    recipe: RobotStreamRecipe, path: Path, before: StreamReport, on_event: OnEvent = ignore
+    recipe: RobotStreamRecipe,
+    path: Path,
+    before: StreamReport,
+    on_event: OnEvent = ignore,
+    backbone: str | None = None,
+    paths: Sequence[Path] = (),
 ) -> RobotStreamRun:
     """Load a finished run in its final state, to measure it again.
 
     Args:
         before: the run's report.
+        backbone, paths: the new places of its backbone and demonstrations; by default the run's.
 
     Raises:
         AegisError: files are missing, damaged or of another backbone, or the questions or held-out
             episodes are not those that the run was measured with.
     """
-    run = load_to_act(path)
+    if not recipe.simulated:  # before a large backbone is loaded
+        recipe = places.here(path, recipe, backbone or recipe.backbone, paths)
+        places.check_demos(path, recipe, "probe")
+    elif paths:
+        places.here(path, recipe, recipe.backbone, paths)  # raises
+    run = load_to_act(path, backbone)
     source = questions(recipe, on_event)
     asked = {name: sha for name, sha in before.inputs.items() if name.startswith(QUESTION_FILE)}
     if changed := changed_inputs(asked, source.sha256):
@@ -418,15 +429,23 @@ def _as_learned(
     return demos
 
 
-def load_to_act(path: Path) -> RobotStreamRun:
+def load_to_act(path: Path, backbone_at: str | None = None) -> RobotStreamRun:
     """Load a finished run that can act, but not learn.
 
+    Args:
+        backbone_at: the new place of its backbone; None: the run's.
+
     Raises:
-        AegisError: the run is not done, or files are missing, damaged or of another backbone.
+        AegisError: the run is not done, its backbone is gone, `backbone_at` is given for a run that
+            holds its own, or files are missing, damaged or of another backbone.
     """
     files.read(path)
     recipe = recipes.load(path / "recipe.yaml", kind=RobotStreamRecipe)
     trains_model = learners.get(recipe.train.method).trains == "model"
+    if trains_model and backbone_at is not None:
+        raise places.refuse(path)
+    # A run with a backbone of its own does not need the one that it began with.
+    recipe = places.here(path, recipe, recipe.backbone if trains_model else backbone_at)
     home = path / BACKBONE if trains_model else None
     name = recipe.backbone if home is None else str(home)
     backbone, fingerprint = _loaded(name, recipe.train.weights)
@@ -563,8 +582,11 @@ def _assemble(
     )
 
 
-def load_policy(path: Path, task: str | None) -> Acting:
+def load_policy(path: Path, task: str | None, backbone: str | None = None) -> Acting:
     """The policy of one of a run's tasks, ready to act in simulation.
+
+    Args:
+        backbone: as in `load_to_act`.
 
     Raises:
         AegisError: the run has not learned the task, no task is named, the task has no simulator,
@@ -574,7 +596,7 @@ def load_policy(path: Path, task: str | None) -> Acting:
     recipe = recipes.load(path / "recipe.yaml", kind=RobotStreamRecipe)
     if not recipe.simulated:  # before a large backbone is loaded
         raise no_simulator(path, recipe.tasks[number])
-    return load_to_act(path).acting(number)
+    return load_to_act(path, backbone).acting(number)
 
 
 def no_simulator(run: Path, task: str) -> AegisError:
@@ -601,7 +623,7 @@ def number_of(path: Path, task: str | None) -> int:
         raise AegisError(
             f"{named} for the stream in '{path}'",
             f"one of its tasks: {', '.join(known)}",
-            f"--task {known[0]}",
+            f"--task {known[0]}; in Python, task={known[0]!r}",
         )
     return known.index(task)
 

@@ -35,6 +35,7 @@ from aegis_cli.training import optimizer_state
 
 S = TypeVar("S", bound=StreamRecipe | RobotStreamRecipe)
 STATE = "state.safetensors"
+_LEARNS = "learns"  # a key: a digest of the settings that a resumed run has to keep
 WHOLE = Share()  # a batch in a single pass
 _GAUSSIAN = tuple(f.name for f in dataclasses.fields(Gaussian))
 
@@ -361,12 +362,14 @@ def save(run: AnyStreamRun, current: torch.optim.Optimizer | None) -> None:
     optimizers = [] if current is None else [current]
     parameters = optimizer_state.to_tensors(run.parameters(), optimizers)
     tensors = parameters | gaussian_tensors(run.gaussians)
-    meta = {
+    meta: dict[str, Any] = {
         "place": dataclasses.asdict(run.current),
         "learning": sorted(run.learning()),
         "structure": {name: site.structure() for name, site in run.sites.items()},
         optimizer_state.STATELESS: optimizer_state.stateless(run.parameters(), optimizers),
     }
+    if isinstance(run.recipe, RobotStreamRecipe):
+        meta[_LEARNS] = _learns(run.recipe)
     artifacts.save(
         run.out / STATE,
         "training-state",
@@ -386,7 +389,7 @@ def restore(run: AnyStreamRun) -> torch.optim.Optimizer | None:
     """
     path = run.out / STATE
     saved = artifacts.load(path, "training-state")
-    if different := changed_inputs(_as_written_now(run, saved.header.inputs), run.inputs):
+    if different := changed_inputs(_as_written_now(run, saved.header), run.inputs):
         raise AegisError(
             f"a different {', '.join(different)} than the run in '{run.out}' began with",
             "the same inputs",
@@ -424,17 +427,28 @@ def place_in(path: Path) -> TaskInProgress:
         return TaskInProgress(**meta["place"])
 
 
-def _as_written_now(run: AnyStreamRun, then: Mapping[str, str]) -> Mapping[str, str]:
-    """The inputs of a state, with the digest of the run's own recipe as this version computes it.
+def _learns(recipe: RobotStreamRecipe) -> str:
+    """The digest of what may not change when the run is resumed."""
+    return files.sha256_value(recipes.learning_part(recipe))
 
-    The recipe digests of earlier versions differ if keys were added since. A digest that an earlier
-    version made of the run's recipe is replaced by today's.
+
+def _as_written_now(run: AnyStreamRun, header: artifacts.Header) -> Mapping[str, str]:
+    """The inputs of a state, with today's digest of the recipe if the run may go on with it.
+
+    That is the case if only keys of `recipes.adjustable` differ. The recipe digests of earlier
+    versions, which recorded no digest of the others, differ also if keys were added since.
     """
-    if not isinstance(run.recipe, RobotStreamRecipe):
+    then, recipe = header.inputs, run.recipe
+    if not isinstance(recipe, RobotStreamRecipe):
         return then
-    written, _ = recipes.read(run.out / "recipe.yaml")
-    earlier = files.sha256_value(recipes.earlier_training_part(run.recipe, written))
-    return {**then, "recipe": run.inputs["recipe"]} if then.get("recipe") == earlier else then
+    same = header.meta.get(_LEARNS) == _learns(recipe)
+    if not same:
+        begun = recipes.load(run.out / "recipe.yaml", kind=RobotStreamRecipe)
+        written, _ = recipes.read(run.out / "recipe.yaml")
+        parts = recipes.training_part(begun), recipes.earlier_training_part(begun, written)
+        known = then.get("recipe") in [files.sha256_value(part) for part in parts]
+        same = known and _learns(begun) == _learns(recipe)
+    return {**then, "recipe": run.inputs["recipe"]} if same else then
 
 
 def changed_inputs(then: Mapping[str, str], now: Mapping[str, str]) -> list[str]:

@@ -7,11 +7,12 @@
     accuracy_matrix.json                       for images
     success_matrix.json, error_matrix.json     for robots: simulated, or not
     parameters.json  stream.json
+    inputs.json                                where a robot's backbone and demonstrations lie
     state.safetensors                          what --resume needs; gone when the stream is done
     ../demos/                                  recordings, for all runs beside this one
 
-All files but the metrics, which hold times, have the same bytes in every equal run, interrupted or
-not.
+All files but the metrics, which hold times, and inputs.json have the same bytes in every equal run,
+interrupted or not.
 """
 
 from __future__ import annotations
@@ -27,9 +28,9 @@ import torch
 from aegis_cli import recipes
 from aegis_cli.common import devices, launch, locks, prefetch
 from aegis_cli.common.errors import AegisError
-from aegis_cli.common.events import OnEvent, Progress, ignore
+from aegis_cli.common.events import OnEvent, Progress, Warned, ignore
 from aegis_cli.common.files import canonical, write_text
-from aegis_cli.continual import files, images, loop, more_tasks, state
+from aegis_cli.continual import files, images, loop, more_tasks, places, state
 from aegis_cli.continual.report import StreamReport
 from aegis_cli.continual.state import AnyStreamRun
 from aegis_cli.recipes import Recipe, RobotStreamRecipe, StreamRecipe
@@ -73,7 +74,10 @@ def _run(
     if files.is_done(out) and not overwrite and not adds:
         _check_same_recording(out, recipe)
         return files.read(out)
-    built = build(recipe, out, on_event)
+    recipe, here = _located(recipe, out, resume and not overwrite)
+    built = build(here, out, on_event)
+    # Its files hold the digest of the recipe that it began with.
+    object.__setattr__(built, "recipe", recipe)
     devices.warn_of_slow_bf16(built.device, recipe.train.precision, on_event)
     if overwrite:
         folder.remove(out)
@@ -82,10 +86,14 @@ def _run(
     optimizer = None
     if (out / state.STATE).exists():
         optimizer = state.restore(built)
+        if not adds:
+            _adjust(built, optimizer, on_event)
         _truncate_metrics(built)
+        _keep_places(out, here)
     else:  # also a run that was interrupted before its first state
         # Written only now, after all inputs of the recipe have been checked.
         folder.begin(out, recipe)
+        _keep_places(out, here)
         built.before_stream()
     _learn(built, optimizer, on_event)
     report = built.report()
@@ -93,6 +101,41 @@ def _run(
     # Last, so that a run that is interrupted while writing can resume from its state.
     (out / state.STATE).unlink(missing_ok=True)
     return report
+
+
+def _located(
+    recipe: StreamRecipe | RobotStreamRecipe, out: Path, resume: bool
+) -> tuple[StreamRecipe | RobotStreamRecipe, StreamRecipe | RobotStreamRecipe]:
+    """The recipe of a run, and the same with the present places of what it reads.
+
+    Raises:
+        AegisError: the run is resumed, and its backbone or demonstrations are gone.
+    """
+    if not isinstance(recipe, RobotStreamRecipe) or not resume:
+        return recipe, recipe
+    return places.as_begun(out, recipe), places.to_learn(out, recipe)
+
+
+def _adjust(run: AnyStreamRun, optimizer: torch.optim.Optimizer | None, on_event: OnEvent) -> None:
+    """Say and write which settings a resumed run takes that it did not have so far."""
+    recipe = run.recipe
+    if not isinstance(recipe, RobotStreamRecipe):
+        return
+    if changes := folder.adjustments(run.out, recipe):
+        text = (
+            f"'{run.out}' goes on with {changes}. This changes memory, time or what is written, "
+            "and what is learned at most by rounding (with igsp and train.accumulate also a little "
+            "where instructions have several lengths); files may differ from those of an "
+            "uninterrupted run"
+        )
+        on_event(Warned("train", text))
+        state.save(run, optimizer)  # first, as it can be resumed with either recipe
+        folder.write_recipe(run.out, recipe)
+
+
+def _keep_places(out: Path, here: StreamRecipe | RobotStreamRecipe) -> None:
+    if isinstance(here, RobotStreamRecipe):
+        places.keep(out, places.of(here))
 
 
 def read_by(recipe: StreamRecipe | RobotStreamRecipe) -> tuple[str | None, ...]:
@@ -129,11 +172,14 @@ def build(
     return _module(recipe).build(recipe, out, on_event)
 
 
-def load(path: Path, before: StreamReport, on_event: OnEvent = ignore) -> AnyStreamRun:
+def load(
+    path: Path, before: StreamReport, on_event: OnEvent = ignore, **moved: Any
+) -> AnyStreamRun:
     """Load a finished run whose figures can be measured again.
 
     Args:
         before: the run's report.
+        moved: of a stream of robot tasks, new places of its inputs, as in `robots.load`.
 
     Raises:
         AegisError: files are missing, damaged or not of one run, or an input that the run was
@@ -141,7 +187,7 @@ def load(path: Path, before: StreamReport, on_event: OnEvent = ignore) -> AnyStr
     """
     recipe = recipes.load_training(path / "recipe.yaml")
     assert not isinstance(recipe, Recipe)
-    return _module(recipe).load(recipe, path, before, on_event)
+    return _module(recipe).load(recipe, path, before, on_event, **moved)
 
 
 def _module(recipe: StreamRecipe | RobotStreamRecipe) -> Any:

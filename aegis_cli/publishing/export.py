@@ -21,7 +21,7 @@ from aegis_cli.common import artifacts, commands
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import OnEvent, Warned, ignore, loading_told
 from aegis_cli.common.files import check_utf8, folder_aside, make_folder, put, write_text
-from aegis_cli.continual import plain, robots
+from aegis_cli.continual import places, plain, robots
 from aegis_cli.data.lerobot import layout
 from aegis_cli.inspection import steps_taken
 from aegis_cli.models import download, lerobot_folder
@@ -77,6 +77,7 @@ def run(
     dtype: str = SOURCE,
     on_event: OnEvent = ignore,
     task: str | None = None,
+    backbone: str | None = None,
 ) -> ExportReport:
     """Write the policy of a run or a checkpoint as a folder for others.
 
@@ -91,6 +92,7 @@ def run(
         repo: where others will find the policy, for the card.
         dtype: dtype of the backbone's weights, SOURCE or one of `STORED_TYPES`.
         task: the task of a stream of robot tasks whose policy is written.
+        backbone: the new place of such a stream's backbone, if it has moved.
 
     Raises:
         AegisError: no policy, a stream's task whose policy is not plain weights, a folder that
@@ -99,6 +101,8 @@ def run(
     """
     # Everything that can be refused without loading gigabytes is refused first.
     of_stream = recipes.is_robot_stream_run(run_path)
+    if backbone is not None and not of_stream:
+        raise places.refuse(run_path)
     number = plain.check(run_path, task) if of_stream else None
     if os.path.lexists(out):  # also a broken link
         raise AegisError(f"'{out}' is there already", "a new folder", "choose another --out")
@@ -112,7 +116,7 @@ def run(
     if number is None:
         run_path = download.locate(run_path)
     with loading_told("export", on_event):
-        loaded = _Loaded.of(run_path, number)
+        loaded = _Loaded.of(run_path, number, backbone)
     policy, meta = loaded.policy, loaded.meta
     if loaded.stream is None:
         checkpoint.check_task(meta, task)
@@ -171,11 +175,11 @@ class _Loaded(NamedTuple):
     task: str | None = None
 
     @classmethod
-    def of(cls, run: Path, number: int | None) -> _Loaded:
+    def of(cls, run: Path, number: int | None, backbone: str | None) -> _Loaded:
         """The policy of a run, or of the numbered task of a stream's run."""
         if number is None:
             return cls(*checkpoint.load_policy(run))
-        stream = robots.load_to_act(run)
+        stream = robots.load_to_act(run, backbone)
         policy, meta = plain.policy(stream, number), stream.meta(number)
         return cls(policy, meta, stream.recipe, stream.names[number])
 

@@ -179,7 +179,7 @@ def _source_checks(recipe: Recipe) -> Iterator[Problem]:
 
 
 def _robot_checks(recipe: RobotStreamRecipe) -> Iterator[Problem]:
-    yield from _demos_checks(recipe.demos, len(recipe.tasks))
+    yield from _demos_checks(recipe.demos, len(recipe.tasks), recipe.simulated)
     yield from _task_checks(recipe)
     train = recipe.train
     yield from _schedule_checks(train)
@@ -261,13 +261,13 @@ def _task_checks(recipe: RobotStreamRecipe) -> Iterator[Problem]:
         yield Problem(found, expected, f"delete rollout.{name}")
 
 
-def _demos_checks(demos: RobotDemos, tasks: int) -> Iterator[Problem]:
+def _demos_checks(demos: RobotDemos, tasks: int, simulated: bool) -> Iterator[Problem]:
     """Check that lists have one item per task, and that there are demonstrations to choose from."""
     if isinstance(demos.paths, tuple) and len(demos.paths) != tasks:
         yield Problem(
             f"demos.paths: {len(demos.paths)} with {tasks} tasks",
             "one per task, in their order, or a text: a single one for all",
-            "correct demos.paths, or delete it to have them recorded",
+            "correct demos.paths" + ", or delete it to have them recorded" * simulated,
         )
     if demos.only is not None and len(demos.only) != tasks:
         yield Problem(

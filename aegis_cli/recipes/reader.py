@@ -228,14 +228,21 @@ def training_part(recipe: Recipe | StreamRecipe | RobotStreamRecipe) -> dict[str
     return part | _own_part(recipe)
 
 
-def adjustable(recipe: Recipe) -> set[str]:
+def adjustable(recipe: Recipe | RobotStreamRecipe) -> set[str]:
     """The keys of `train` with which a run of this recipe may be resumed at any value.
 
     They change memory, time or how often something is written, and what is learned at most by
-    rounding.
+    rounding; in a stream with igsp also by the price of experts, a mean over a pass's tokens.
     """
     found = adjusting(recipe.train)
     return found - {"accumulate"} if recipe.train.method in PASSES_DIFFER else found
+
+
+def learning_part(recipe: RobotStreamRecipe) -> dict[str, Any]:
+    """The training part without the keys that may change when the run is resumed."""
+    part, free = training_part(recipe), adjustable(recipe)
+    train = {name: value for name, value in part["train"].items() if name not in free}
+    return part | {"train": train}
 
 
 def earlier_training_part(recipe: RobotStreamRecipe, written: Mapping[str, Any]) -> dict[str, Any]:

@@ -184,9 +184,14 @@ class RobotTrain:
         doc="Share of each task's episodes that is kept for the validation loss.",
     )
     checkpoint_every: int = key(
-        POSITIVE, default=100, doc="Steps between two checkpoints; every task ends with one too."
+        POSITIVE,
+        default=100,
+        adjusts=True,
+        doc="Steps between two checkpoints; every task ends with one too.",
     )
-    log_every: int = key(POSITIVE, default=25, doc="Steps between two lines of metrics.jsonl.")
+    log_every: int = key(
+        POSITIVE, default=25, adjusts=True, doc="Steps between two lines of metrics.jsonl."
+    )
     precision: str = key(
         choice(*PRECISIONS),
         default="auto",
@@ -217,6 +222,7 @@ class RobotTrain:
     gradient_checkpointing: bool = key(
         default=False,
         later=True,
+        adjusts=True,
         doc="Recompute activations in the backward pass, also the action expert's: less memory at "
         "the price of a second forward pass. Hugging Face backbones only.",
     )
@@ -224,6 +230,7 @@ class RobotTrain:
         POSITIVE,
         default=1,
         later=True,
+        adjusts=True,
         doc="Number of passes that a step's frames are split into, to save memory (gradient "
         "accumulation).",
     )

@@ -53,7 +53,7 @@ class Reader:
         policy = self._policy
         return {
             "server": f"aegis {__version__}",
-            "task": policy.task,
+            "task": policy.task or policy.in_stream,
             "images": list(self.images),
             "state": STATE,
             "prompt": PROMPT,

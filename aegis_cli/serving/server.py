@@ -57,6 +57,7 @@ def run(
     on_ready: Callable[[Serving], None],
     ensemble: float | None = None,
     tell: Tell = _silently,
+    backbone: str | None = None,
 ) -> None:
     """Serve a run's policy until a signal ends the process.
 
@@ -65,7 +66,7 @@ def run(
         port: 0 takes a free one.
         prompt: the instruction for observations without one.
         seed: seed of the noise, the same for every connection.
-        precision, ensemble: see `load_policy`.
+        precision, ensemble, backbone: see `load_policy`.
         on_ready: called with the address once the server listens.
         tell: called with a line about what is loaded, who connects, what is refused, positions far
             from those of the training, and who disconnects.
@@ -80,7 +81,7 @@ def run(
     if prompt is not None and not prompt.strip():
         raise AegisError("an empty --prompt", "an instruction", "leave --prompt out")
     tell(f"loading '{run_path}'")  # a large VLM takes a minute or more
-    policy = load_policy(run_path, task, seed, precision, ensemble=ensemble)
+    policy = load_policy(run_path, task, seed, precision, ensemble, backbone)
     if prompt is not None:
         policy.check_instruction(prompt)
     with interrupts.deferred() as signaled:

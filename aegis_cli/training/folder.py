@@ -104,11 +104,15 @@ def goes_on(out: Path, recipe: Trained) -> bool:
 def continues(out: Path, recipe: Trained) -> bool:
     """Whether a run may be resumed with `recipe`.
 
-    Its backbone may have another path there: the checkpoints of a policy's run hold the backbone's
-    digest, which is compared later. Keys of `recipes.adjustable` may have other values.
+    Its backbone may have another path there: the checkpoints of a policy's run, and the state of a
+    stream of robot tasks, hold the backbone's digest, which is compared later.
+    Keys of `recipes.adjustable` may have other values.
     """
     begun = _begun(out, recipe)
-    if isinstance(begun, Recipe) and isinstance(recipe, Recipe) and checkpoint.begun(out):
+    of_policy = isinstance(begun, Recipe) and checkpoint.begun(out)
+    of_stream = isinstance(begun, RobotStreamRecipe) and is_learning(out)
+    if (of_policy or of_stream) and not isinstance(recipe, StreamRecipe):
+        assert not isinstance(begun, StreamRecipe)
         # A backbone is PATH#LAYERS. Only the path may differ: other layers of one model have the
         # same weights and the same digest, but train differently.
         _, layers_there = backbones.divided(begun.backbone)
@@ -118,21 +122,26 @@ def continues(out: Path, recipe: Trained) -> bool:
     return recipes.training_part(_adjusted(begun, recipe)) == recipes.training_part(recipe)
 
 
+def is_learning(out: Path) -> bool:
+    """Whether a stream of robot tasks in `out` has files with the digest of its backbone."""
+    return any((out / name).is_file() for name in ("state.safetensors", "expert.safetensors"))
+
+
 def _adjusted(recipe: T, like: T) -> T:
     """The recipe with another's values of the keys that may change when a run is resumed."""
-    if not isinstance(recipe, Recipe) or not isinstance(like, Recipe):
-        return recipe  # a stream's may not
+    if isinstance(recipe, StreamRecipe) or isinstance(like, StreamRecipe):
+        return recipe  # a stream of images has none
     names = recipes.adjustable(recipe) & recipes.adjustable(like)
     values = {name: getattr(like.train, name) for name in names}
     return dataclasses.replace(recipe, train=dataclasses.replace(recipe.train, **values))
 
 
-def as_begun(out: Path, recipe: Recipe) -> Recipe:
+def as_begun(out: Path, recipe: T) -> T:
     """The recipe with the run's values of the keys that may change when it is resumed."""
-    return _adjusted(recipe, recipes.load(out / "recipe.yaml", kind=Recipe))
+    return _adjusted(recipe, recipes.load(out / "recipe.yaml", kind=type(recipe)))
 
 
-def adjustments(out: Path, recipe: Recipe) -> str:
+def adjustments(out: Path, recipe: Recipe | RobotStreamRecipe) -> str:
     """The keys of `recipe` that change when the run is resumed with it; empty if none does."""
     there, here = as_begun(out, recipe).train, recipe.train
     names = {n for n in recipes.adjustable(recipe) if f"train.{n}" not in recipes.retired()}

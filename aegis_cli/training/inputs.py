@@ -19,7 +19,7 @@ from aegis_cli.data.selection import Paths
 NAME = "inputs.json"
 _RELATIVE = "relative"  # a key: the places relative to the run
 _MERGED_FROM = "merged_from"  # a key: the run that aegis merge has made this one from
-_BEGAN_IN = "began_in"  # a key: the folder that the recipe's own paths are relative to
+BEGAN_IN = "began_in"  # a key: the folder that the recipe's own paths are relative to
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ def keep(
     def relative(given: str) -> str:
         return os.path.relpath(given, here) if Path(given).is_absolute() else given
 
-    others = {_BEGAN_IN: first}
+    others = {BEGAN_IN: first}
     if merged is not None:
         others[_MERGED_FROM] = str(merged.absolute())
     seen = asdict(inputs.each(relative)) | {key: relative(at) for key, at in others.items()}
@@ -87,7 +87,7 @@ def began_in(out: Path) -> Path | None:
 
     None if the run does not say, or the folder is gone.
     """
-    return _folder(out, _BEGAN_IN)
+    return _folder(out, BEGAN_IN)
 
 
 def merged_from(out: Path) -> Path | None:

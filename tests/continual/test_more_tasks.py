@@ -10,12 +10,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 from samples.interrupted import at_each
 from samples.lerobot import frame_cache  # noqa: F401
 from samples.own_robots import TASKS, Done, robot
 from samples.robots import Make
 from samples.training_runs import contents
 
+from aegis_cli import recipes
+from aegis_cli.common import artifacts
 from aegis_cli.common.errors import AegisError
 from aegis_cli.common.events import Warned
 from aegis_cli.continual import dry_run, files, robots, state, train
@@ -190,3 +193,17 @@ def test_the_command_takes_the_folder_and_the_longer_lists(
     (run.parent / "bench.yaml").write_text(to_yaml(real()))
     code, out, _ = aegis("train", run.parent / "bench.yaml", "--out", run, "--resume", "--json")
     assert code == 0 and json.loads(out)["tasks"] == list(TASKS)
+
+
+def test_settings_of_memory_and_of_what_is_written_may_change(
+    run: Path, real: Make, done: Done
+) -> None:
+    told: list[Any] = []
+    recipe = real(accumulate=2, checkpoint_every=3, log_every=2)
+    train.run(recipe, run, resume=True, on_event=told.append)
+    said = [event.text for event in told if isinstance(event, Warned)]
+    assert any("train.accumulate: 2 instead of 1" in text for text in said)
+    assert recipes.load(run / "recipe.yaml", kind=RobotStreamRecipe).train == recipe.train
+    wanted = artifacts.load(done("igsp")[1] / robots.ACTION_EXPERT).tensors
+    found = artifacts.load(run / robots.ACTION_EXPERT).tensors
+    torch.testing.assert_close(found, wanted, rtol=1e-4, atol=1e-5)

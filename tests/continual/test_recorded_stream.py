@@ -30,6 +30,7 @@ from aegis_cli.deploy import load_acting, load_policy
 from aegis_cli.evaluation import open_loop
 from aegis_cli.models.action_errors import predict
 from aegis_cli.recipes import RobotDemos, to_yaml
+from aegis_cli.serving.observations import Reader
 
 pytestmark = pytest.mark.usefixtures("frame_cache")
 
@@ -271,6 +272,7 @@ def test_the_policy_of_a_task_acts_on_the_robot(
         batch = shown.batch(torch.tensor([3]), 1)
         picture, position = batch.images[0].numpy(), batch.proprio[0].numpy()
         observation = dict(zip(names, position.tolist(), strict=True)) | {"top": picture}
+        assert Reader(policy).greeting()["task"] == task
         action = policy.select_action(observation, TEXTS[task])
         run.activate(number)
         draws = torch.Generator().manual_seed(0)
@@ -285,6 +287,9 @@ def test_no_simulator_plays_it(done: Done) -> None:
     with pytest.raises(AegisError, match="(?s)'pick'.*no simulator has.*aegis serve") as caught:
         load_acting(out, "pick")
     assert "--task pick" in caught.value.fix
+    with pytest.raises(AegisError, match="no --task") as unnamed:
+        load_policy(out)
+    assert "task='pick'" in unnamed.value.fix
     with pytest.raises(AegisError, match="one of its tasks: pick, open-drawer"):
         load_acting(out, "reach")
 
@@ -380,6 +385,16 @@ def test_what_cannot_be_trained(
     place: Path, bad: Callable[..., str], args: tuple[str, ...], says: tuple[str, ...]
 ) -> None:
     bad(*TRAIN, *args, says=says)
+
+
+def test_only_simulated_tasks_are_said_to_be_recorded(
+    place: Path, aegis: Callable[..., tuple[int, str, str]]
+) -> None:
+    for tasks, says in (("[a, b]", False), ("[reach, point]", True)):
+        more = ("--set", f"tasks={tasks}", "--set", "demos.paths=[picked]")
+        code, _, err = aegis(*TRAIN, *more)
+        assert code == 2 and "demos.paths: 1 with 2 tasks" in err
+        assert ("have them recorded" in err) == says
 
 
 def test_demonstrations_of_a_simulated_task_are_told_by_what_they_say(

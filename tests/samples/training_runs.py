@@ -92,13 +92,17 @@ def naive_run(whole_run: Callable[[str], Path]) -> Path:
 
 
 def contents(out: Path) -> dict[str, bytes | str]:
-    """Every file of a run folder except metrics.jsonl, whose times differ; links by target."""
+    """Every file of a run folder except metrics.jsonl, whose times differ; links by target.
+
+    Without a stream's inputs.json too, which has paths relative to the run.
+    """
     paths = (p for p in sorted(out.rglob("*")) if p.is_symlink() or p.is_file())
     found = {
         str(p.relative_to(out)): str(p.readlink()) if p.is_symlink() else p.read_bytes()
         for p in paths
     }
-    return {name: value for name, value in found.items() if name != "metrics.jsonl"}
+    differs = {"metrics.jsonl"} | ({inputs.NAME} if recipes.is_stream_run(out) else set())
+    return {name: value for name, value in found.items() if name not in differs}
 
 
 def metrics(out: Path, without: frozenset[str] | set[str] = frozenset()) -> list[dict[str, float]]:

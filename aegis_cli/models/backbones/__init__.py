@@ -19,7 +19,7 @@ from aegis_cli.models.backbones.dual import DualEncoder
 EMBEDDED, EMBEDDED_EASY = shipped.EMBEDDED, shipped.EMBEDDED_EASY
 EMBEDDED_DUAL = shipped.EMBEDDED_DUAL
 SHIPPED = shipped.FILES
-_LOCAL = ("runs/", "models/")  # our folders in recipes and docs, whose names look like hub ids
+LOCAL = ("runs/", "models/")  # our folders in recipes and docs, whose names look like hub ids
 
 
 def locate(name: str) -> Path:
@@ -204,7 +204,7 @@ def _no_backbone(name: str) -> AegisError:
     fix = f"check the path, and give it as {model_folder.GIVE}"
     if hub.is_id(name) and not _has_transformers():
         fix += "; a model on the hub needs: pip install 'aegis-vla[hf]'"
-    elif hub.is_id(name) and not name.startswith(_LOCAL):
+    elif hub.is_id(name) and not name.startswith(LOCAL):
         fix += f"; for a model on the hub: hf download {name} --local-dir MODEL"
     return AegisError(found, expected, fix)
 
