@@ -386,7 +386,7 @@ class Guard(Removable):
             dual.close_row()
 
     def settle(self) -> None:
-        """Constrain the pending steps now, before a model is saved or evaluated.
+        """Constrain the pending steps now, before weights are saved, loaded, copied or evaluated.
 
         Only `nullspace` and `kfac` with `every` above 1 need it, because they constrain that many
         steps together: in between, the weights also contain what the last steps have moved along

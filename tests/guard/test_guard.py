@@ -51,6 +51,7 @@ def anchor(tmp_path_factory: pytest.TempPathFactory) -> Path:
 # --- equal to training ----------------------------------------------------------------------------
 
 
+@pytest.mark.filterwarnings("ignore:the weight of kfac")  # one is strong on purpose
 @pytest.mark.parametrize(
     ("method", "options"),
     [
