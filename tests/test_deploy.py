@@ -204,7 +204,7 @@ def test_of_a_stream_it_takes_a_picture_of_each_camera(
         views=[{}],
     )
     monkeypatch.setattr(robots, "number_of", lambda *_: 0)
-    monkeypatch.setattr(robots, "load_to_act", lambda _: run)
+    monkeypatch.setattr(robots, "load_to_act", lambda *_: run)
     found = load_policy(tmp_path, task="libero/object")
     several = len(cameras) > 1
     assert found.cameras == (cameras if several else ())

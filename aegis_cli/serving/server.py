@@ -81,7 +81,7 @@ def run(
     if prompt is not None and not prompt.strip():
         raise AegisError("an empty --prompt", "an instruction", "leave --prompt out")
     tell(f"loading '{run_path}'")  # a large VLM takes a minute or more
-    policy = load_policy(run_path, task, seed, precision, ensemble, backbone)
+    policy = load_policy(run_path, task, seed, precision, ensemble=ensemble, backbone=backbone)
     if prompt is not None:
         policy.check_instruction(prompt)
     with interrupts.deferred() as signaled:

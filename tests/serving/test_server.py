@@ -339,7 +339,7 @@ def test_a_temporal_ensemble_answers_with_the_one_action_of_a_step() -> None:
 def test_the_decay_that_was_asked_for_is_the_policys(
     aegis: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def loaded(*_: Any, ensemble: float | None) -> None:
+    def loaded(*_: Any, ensemble: float | None, backbone: str | None) -> None:
         raise AegisError(f"with {ensemble}", "nothing", "no more")
 
     monkeypatch.setattr(server, "load_policy", loaded)
