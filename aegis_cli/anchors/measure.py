@@ -158,7 +158,7 @@ def _warn_of_few(samples: int, settings: Settings, on_event: OnEvent) -> None:
     if samples < settings.samples:
         more = "Give more data"
         if settings.source != "demos":
-            more += ": four of ten questions are for anchors, the others for tuning and probes"
+            more += ": the questions about four of ten images are for anchors"
     text = (
         f"measured on {samples:,} {of}, and {', '.join(others or ['moments'])} need at least "
         f"{fewest} to tell what the backbone knows: methods that read them may protect less. {more}"

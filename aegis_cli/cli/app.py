@@ -433,6 +433,8 @@ def train(
     if not isinstance(resolved, Recipe):
         if isinstance(resolved, RobotStreamRecipe):
             advice.of_questions(resolved.backbone, resolved.probe.only_set)
+            if run is not None:
+                resuming.check_seen(run, [resolved.probe.only_set], "train")
         dry_run_of = stages.DRY_RUN_STREAM if isinstance(resolved, RobotStreamRecipe) else None
         no_dry_run = dry_run and dry_run_of is None
         unused = {"--demos": demos, "--anchor": anchor, "--dry-run": no_dry_run}
@@ -775,8 +777,9 @@ def probe(
         Option(
             parser=demonstrations_path,
             metavar="PATH",
-            help="New place of the demonstrations of a stream's task without a simulator, one for "
-            "each task in their order; default: where the stream found them.",
+            help="New place of the demonstrations of a stream of tasks without a simulator: repeat "
+            "it for each task, in their order, or give one path where the recipe has one. Default: "
+            "where the stream found them.",
         ),
     ] = None,
     device: Device = None,
@@ -797,6 +800,10 @@ def probe(
             own |= set(_OF_ROBOT_STREAMS)
         options = [name for name in given(ctx) if name not in own]
         stages.refuse_options(options, f"in '{target}'")
+        if is_robot_stream_run(Path(target)):
+            own_recipe = load_training(Path(target) / "recipe.yaml")
+            assert isinstance(own_recipe, RobotStreamRecipe)
+            resuming.check_seen(Path(target), [own_recipe.probe.only_set], "probe")
         moved = {"backbone": backbone, "demos": demos or []}
         stages.PROBE_STREAM.run(Path(target), device=device, as_json=as_json, **moved)
         return
@@ -959,7 +966,7 @@ def compare(
     Shown is what `aegis run`, `aegis probe`, `aegis rollout` and `aegis evaluate` have measured of
     each. A second table has each run's differences from one of them, on the same questions and
     episodes, with 95 % intervals. Streams of the same tasks are compared by the figures of their
-    matrices, the VQA that they lost, and the numbers that they store.
+    matrices, the VQA that they lost, and how many numbers they store.
 
     \b
     Example: aegis compare runs/x runs/y

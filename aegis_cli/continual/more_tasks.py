@@ -83,7 +83,7 @@ def begin(run: AnyStreamRun, on_event: OnEvent) -> None:
     new = ", ".join(run.names[len(report.tasks) :])
     if changes:
         new += f" and {changes}"
-    text = f"'{run.out}' goes on with {new}; until it is finished, it cannot be used"
+    text = f"'{run.out}' goes on with {new}; until it has finished, it cannot be served or probed"
     on_event(Warned("train", text))
 
 

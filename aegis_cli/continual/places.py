@@ -63,7 +63,10 @@ def keep(out: Path, places: Places) -> None:
 def is_kept(out: Path, recipe: RobotStreamRecipe) -> bool:
     """Whether the run's folder suffices to find what a command has named."""
     known = _kept(out)
-    return known is None or known[0] == of(recipe)
+    try:
+        return known is None or known[0] == of(here(out, recipe))
+    except AegisError:  # the backbone is gone
+        return False
 
 
 def here(
@@ -96,14 +99,16 @@ def here(
             raise AegisError(
                 f"'{own}' is gone, the backbone of the stream in '{out}'",
                 "the model that the stream was trained with",
-                f"bring it back, or give its new path: {fix or _OPTION}",
+                f"bring it back, or give its new path{_and_layers(recipe)}: {fix or _OPTION}",
             )
     recipe = dataclasses.replace(recipe, backbone=backbone)
     if demos:
         return _with_demos(out, recipe, demos)
     before, now = [] if begun is None else _named(begun), list(_named(recipe))
     for number, name in enumerate(now):
-        if known is not None and number < len(known[0].demos) and name == before[number]:
+        if known is None or number >= min(len(known[0].demos), len(before)):
+            continue
+        if name == before[number]:
             now[number] = _found(out, name, known[0].demos[number], known[1].demos[number])
     if now and isinstance(recipe.demos.paths, str):
         now = now[:1]
@@ -122,6 +127,12 @@ def to_learn(out: Path, recipe: RobotStreamRecipe) -> RobotStreamRecipe:
     return found
 
 
+def _and_layers(recipe: RobotStreamRecipe) -> str:
+    """A reminder that a new path needs the layers that the recipe names, if it names any."""
+    layers = backbones.divided(recipe.backbone)[1]
+    return "" if layers is None else f", followed by #{layers}"
+
+
 def as_begun(out: Path, recipe: RobotStreamRecipe) -> RobotStreamRecipe:
     """The recipe with the name of the backbone that the run in `out` began with, if there is one.
 
@@ -134,9 +145,9 @@ def as_begun(out: Path, recipe: RobotStreamRecipe) -> RobotStreamRecipe:
 def refuse(run: Path) -> AegisError:
     """The error for a backbone's new place, where the run holds its backbone itself."""
     return AegisError(
-        f"another place of the backbone for '{run}', which holds its own",
+        f"a new place of the backbone for '{run}', which holds its own",
         "a stream of robot tasks that was learned with experts beside a backbone",
-        "leave the backbone out",
+        "leave out --backbone (in Python, backbone=)",
     )
 
 
@@ -217,8 +228,16 @@ def _backbones(known: tuple[Places, Places] | None) -> tuple[str | None, str | N
 
 
 def _found(out: Path, given: str, kept: str | None, relative: str | None) -> str:
-    """Where something is that a run names: as given, else as kept, else beside the run."""
-    if kept is None or relative is None or _is_there(given) or not Path(kept).is_absolute():
+    """Where something is that a run names: as kept, else as given, else beside the run.
+
+    An absolute path that is there is taken as given.
+    """
+    if kept is None or relative is None or not Path(kept).is_absolute():
+        return given
+    # A relative path may lead to something else here, in another checkout for example.
+    if not Path(given).is_absolute() and _is_there(kept):
+        return kept
+    if _is_there(given):
         return given
     own, layers = backbones.divided(relative)
     moved = _with_layers(os.path.normpath(out.absolute() / own), layers)
@@ -262,7 +281,8 @@ def _kept(out: Path) -> tuple[Places, Places] | None:
     raise AegisError(
         f"'{path}' is damaged: no places of a backbone and demonstrations",
         "the file as Aegis wrote it",
-        "delete it, and name them: aegis train RUN --set backbone=MODEL --set demos.paths=PATHS",
+        "delete it; then name them: --backbone MODEL and, for probe, --demos PATH; of an "
+        "unfinished run: aegis train RUN --set backbone=MODEL --set demos.paths=PATHS",
     )
 
 

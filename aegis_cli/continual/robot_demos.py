@@ -102,8 +102,8 @@ def relative_places(
             raise AegisError(f"for task '{task}', {e.found}", e.expected, e.fix) from None
         if lacking and not absolute:
             text = (
-                f"all actions of '{task}' are relative: none is named {' or '.join(lacking)} "
-                f"(train.relative_exclude), but {', '.join(own.actions)}"
+                f"all actions of '{task}' are relative: none of {', '.join(own.actions)} contains "
+                f"{' or '.join(lacking)} (train.relative_exclude)"
             )
             on_event(Warned("train", text))
     return found

@@ -71,7 +71,8 @@ def _run(
     on_event: OnEvent,
 ) -> StreamReport:
     adds = more_tasks.check(out, recipe, resume, overwrite, read_by(recipe))
-    if files.is_done(out) and not overwrite and not adds:
+    # With `overwrite`, a damaged report of the run that goes does not matter.
+    if not overwrite and not adds and files.is_done(out):
         _check_same_recording(out, recipe)
         return files.read(out)
     recipe, here = _located(recipe, out, resume and not overwrite)

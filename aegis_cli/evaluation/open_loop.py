@@ -43,6 +43,7 @@ from aegis_cli.models.policy_meta import PolicyMeta
 from aegis_cli.training import checkpoint, inputs
 
 _STAGE = "evaluate"
+_ENOUGH = 30  # frames from which the spread of actions tells their units
 TRACED = 3  # episodes that a plot shows
 _BY_PART = ("dimensions", "horizon")  # of the report
 FULL_ACTION = "share of a full action"  # the unit of every simulated task's actions
@@ -284,7 +285,9 @@ def evaluated(
         seed=seed,
         traces=_traces(policy, meta, shown, chosen, seed, batch_size) if asked.traced else [],
     )
-    _warn_of_other_units(report, on_event)
+    # Chosen episodes may be of a task in which the robot hardly moves.
+    if report.split in (OTHER, UNKNOWN) and report.frames >= _ENOUGH:
+        _warn_of_other_units(report, on_event)
     _warn_of_standing_still(report, on_event)
     return report
 

@@ -116,7 +116,7 @@ def start(
     def why_strong(rate: float) -> str | None:
         if method != "kfac":
             return None
-        return kfac.why_strong(chosen["weight"], rate, "the guard's option weight")
+        return kfac.why_strong(chosen["weight"], rate, "weight")
 
     sha256 = artifacts.sha256_file(path)
     return StartedMethod(parts, widths, unprotected, sha256, header.fingerprint, why_strong)

@@ -456,20 +456,28 @@ class _BufferWatch:
         )
 
 
+HELD = 100  # steps without a rise after which a learning rate is taken for the highest
+
+
 class _RateWatch:
     """Warns at the peak of the learning rate if a method is too strong for it."""
 
     def __init__(self, why_strong: Callable[[float], str | None]) -> None:
         self._why_strong, self._highest, self._looked = why_strong, 0.0, False
+        self._held = 0  # steps since the rate last rose
 
     def look(self, groups: Sequence[Mapping[str, Any]]) -> None:
         """Check the rates of a step's groups."""
         if self._looked:
             return
         rate = max((float(group.get("lr", 0)) for group in groups), default=0.0)
-        # A warm-up begins far below the peak, so wait until the rate rises no further.
         if rate > self._highest or rate == 0:
-            self._highest = max(rate, self._highest)
+            self._highest, self._held = max(rate, self._highest), 0
+            return
+        # A warm-up begins far below the peak, and some schedules rise only every few steps. So wait
+        # until the rate falls, or has stayed for long.
+        self._held += 1
+        if rate == self._highest and self._held < HELD:
             return
         self._looked = True
         if why := self._why_strong(self._highest):

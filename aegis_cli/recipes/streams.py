@@ -162,7 +162,7 @@ class RobotTrain:
         default=None,
         later=True,
         doc="Words in the names of actions that stay absolute under `relative_actions`, such as "
-        "gripper; each is in a name of at least one task.",
+        "gripper. Each word has to be in an action's name in at least one task.",
     )
     final_lr_share: float = key(
         UP_TO_ONE,

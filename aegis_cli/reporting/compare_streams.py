@@ -79,7 +79,8 @@ def run(paths: Sequence[Path], on_event: OnEvent = ignore) -> StreamComparison:
             )
     differs = sorted({name for report in reports for name in _changed(first, report)})
     if differs:
-        text = f"the streams differ in {', '.join(differs)}: so may their figures, for that reason"
+        listed = ", ".join(differs)
+        text = f"the streams differ in {listed}, which may also explain different figures"
         on_event(Warned("compare", text))
     rows = [_row(str(path), report) for path, report in zip(paths, reports, strict=True)]
     return StreamComparison(first.score, first.tasks, rows, differs)

@@ -238,7 +238,7 @@ def test_where_questions_run_out_more_samples_are_not_advised(
     settings = Settings(samples=24, vqa=str(path))
     measure.run(str(tiny_folder), settings, tmp_path / "a.safetensors", on_event=seen.append)
     (said,) = [event.text for event in seen if isinstance(event, Warned)]
-    assert "four of ten questions are for anchors" in said and "--samples" not in said
+    assert "about four of ten images are for anchors" in said and "--samples" not in said
 
 
 @pytest.mark.parametrize("part", ["curvature", "fisher"])

@@ -382,7 +382,7 @@ def test_an_official_file_that_is_none(bad: Callable[..., str], place: Path) -> 
     whole, told = path.read_text(), annotations.read_text()
     for content, says in (
         (whole[:-5], "not JSON"),
-        ("[]", "no list of questions"),
+        ("[]", "no usable question"),  # a list of questions, with another file's name
         (json.dumps({"questions": 5}), "no list of questions"),
     ):
         path.write_text(content)

@@ -331,11 +331,12 @@ def test_probe_rollout_pretrain_run_arguments(aegis, stage, recipe, tmp_path, mo
         4,
         "--json",
     )
+    load = calls[0][1].pop("load")
+    assert (load.func, load.keywords) == (load_acting, {"backbone": None})
     assert calls == [
         (
             (Path("runs/x"), "point", 3, "held-out", Path("v.gif")),
             {
-                "load": load_acting,
                 "seed": 4,
                 "keep": True,
                 "ensemble": None,

@@ -18,7 +18,7 @@ from samples.robots import Make
 from samples.training_runs import contents
 
 from aegis_cli.common.errors import AegisError
-from aegis_cli.continual import evaluate, probe, robots, train
+from aegis_cli.continual import evaluate, places, probe, robots, train
 from aegis_cli.deploy import load_policy
 from aegis_cli.publishing import export
 from aegis_cli.recipes import RobotDemos, RobotStreamRecipe, to_yaml
@@ -72,6 +72,34 @@ def test_a_run_is_used_from_another_folder(
 ) -> None:
     monkeypatch.chdir(place.parent / "elsewhere")
     use(run, Path("policy"))
+
+
+def test_what_has_the_same_names_in_another_folder_is_not_taken_for_its_inputs(
+    run: Path, place: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other = place.parent / "elsewhere"
+    (other / "models" / "tiny").mkdir(parents=True)
+    shutil.copytree(place / "datasets" / TASKS[1], other / "datasets" / TASKS[0])
+    monkeypatch.chdir(other)
+    use(run, Path("policy"))
+
+
+def test_demonstrations_that_only_the_command_names_are_taken_again(run: Path, place: Path) -> None:
+    """As where they were recorded, are gone, and were given when the run was resumed."""
+    recorded = RobotStreamRecipe(name="x", tasks=("reach", "point"), backbone="models/tiny")
+    given = relative(recorded)
+    (run / "recipe.yaml").write_text(to_yaml(recorded))
+    found = places.here(run, given)
+    assert found.demos == given.demos and found.backbone == str(place / "models" / "tiny")
+
+
+def test_a_damaged_report_does_not_keep_a_run_from_being_overwritten(run: Path, real: Make) -> None:
+    whole = contents(run)
+    (run / "stream.json").write_text("{")
+    with pytest.raises(AegisError, match="not JSON"):
+        train.run(relative(real("isolated-lora")), run, resume=True)
+    train.run(relative(real("isolated-lora")), run, overwrite=True)
+    assert contents(run) == whole
 
 
 def test_a_run_that_has_moved_with_its_inputs_is_used(
@@ -152,6 +180,19 @@ def test_probe_takes_the_new_places_of_demonstrations(run: Path, place: Path, ae
     assert code == 0 and json.loads(out)["largest_difference"] == 0, err
     code, _, err = aegis("probe", run, *named[:2])
     assert code == 2 and "1 of --demos" in err
+
+
+@pytest.mark.parametrize("command", ["train", "probe"])
+def test_a_relative_question_set_names_the_folder_to_call_the_command_in(
+    command: str, run: Path, place: Path, aegis: Aegis, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (place / "questions.jsonl").write_text("{}")
+    recipe = run / "recipe.yaml"
+    recipe.write_text(recipe.read_text().replace("vqa: scenes", "vqa: questions.jsonl"))
+    monkeypatch.chdir(place.parent / "elsewhere")
+    code, _, err = aegis(command, run)
+    assert code == 2 and "no 'questions.jsonl' here" in err
+    assert f"cd {place} && aegis {command} {run}" in err
 
 
 def test_a_backbones_place_is_refused_where_a_run_holds_its_own(

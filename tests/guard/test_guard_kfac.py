@@ -38,6 +38,7 @@ from aegis_cli.core.anchor import Anchor
 from aegis_cli.core.curvature import curvatures
 from aegis_cli.core.pairs import minus
 from aegis_cli.core.spectrum import DENSE
+from aegis_cli.guard import stepper
 from aegis_cli.guard.stepper import SlowedStep
 from aegis_cli.methods import kfac
 from aegis_cli.methods.base import Parts
@@ -448,21 +449,22 @@ def warned(model: nn.Module, guard: Guard, rates: list[float], is_automatic: boo
         optimizer.zero_grad()
         if said:
             (text,) = (str(warning.message) for warning in said)
-            assert "the guard's option weight=" in text and "may learn little" in text
+            assert ": weight=" in text and "may learn little" in text
             found.append(step)
     return found
 
 
 @pytest.mark.parametrize("is_automatic", [False, True])
 def test_a_guard_warns_once_of_a_weight_too_strong_for_the_learning_rate(
-    is_automatic: bool, tmp_path: Path
+    is_automatic: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """At the end of a warm-up, and by the rate of what it guards."""
+    monkeypatch.setattr(stepper, "HELD", 2)
     path = measured(make(), tmp_path / "anchor.safetensors")
     for rates, expected in (
-        ([1e-5] * 3, [1]),  # the default weight is 3,000 times the rate
-        ([0.0, 1e-6, 2e-6, 2e-6, 1e-6], [3]),
-        ([1e-6, 1e-4, 2e-3, 2e-3, 1e-6], []),  # 15 times the peak
+        ([1e-5] * 4, [2]),  # the default weight is 3,000 times the rate
+        ([0.0, 1e-6, 2e-6, 1e-6], [3]),
+        ([1e-6, 1e-6, 1e-4, 2e-3, 2e-3, 1e-6], []),  # 15 times the peak
         ([0.0] * 3, []),
     ):
         model = only_maps(make())
@@ -471,7 +473,10 @@ def test_a_guard_warns_once_of_a_weight_too_strong_for_the_learning_rate(
         guard.remove()
 
 
-def test_a_weight_of_15_times_the_rate_is_not_too_strong(tmp_path: Path) -> None:
+def test_a_weight_of_15_times_the_rate_is_not_too_strong(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(stepper, "HELD", 2)
     path = measured(make(), tmp_path / "anchor.safetensors")
     model = only_maps(make())
     guard = Guard(model, path, method="kfac", weight=15 * 1e-5)

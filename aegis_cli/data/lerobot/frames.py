@@ -119,7 +119,7 @@ class VideoPart:
         except AegisError as error:
             if error.fix != layout.AGAIN:  # such as a file that Git LFS has not downloaded
                 raise
-            fix = f"get the dataset again, or leave its episodes {self.episodes} out ({CHOOSING})"
+            fix = f"get the dataset again, or leave out episodes {self.episodes} ({CHOOSING})"
             raise AegisError(error.found, error.expected, fix) from error
 
 
