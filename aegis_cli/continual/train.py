@@ -21,7 +21,7 @@ import dataclasses
 import json
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 
@@ -77,8 +77,8 @@ def _run(
         return files.read(out)
     recipe, here = _located(recipe, out, resume and not overwrite)
     built = build(here, out, on_event)
-    # Its files hold the digest of the recipe that it began with.
-    object.__setattr__(built, "recipe", recipe)
+    # Its files hold the digest of the recipe that it began with, of the same kind.
+    cast(Any, built).recipe = recipe
     devices.warn_of_slow_bf16(built.device, recipe.train.precision, on_event)
     if overwrite:
         folder.remove(out)
