@@ -8,7 +8,7 @@ from __future__ import annotations
 import faulthandler
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
@@ -95,6 +95,7 @@ from aegis_cli.recipes import (
     Anchor,
     Recipe,
     RobotStreamRecipe,
+    StreamRecipe,
     StudyRecipe,
     is_robot_stream_run,
     is_stream_run,
@@ -431,29 +432,16 @@ def train(
     as_they_are = _kept_options(ctx, device, as_json)
     advice.of_settings(resolved, overrides or [])
     if not isinstance(resolved, Recipe):
+        no_dry_run = dry_run and isinstance(resolved, StreamRecipe)
+        unused = {"--demos": demos, "--anchor": anchor, "--dry-run": no_dry_run}
+        given_in_vain = [name for name, value in unused.items() if value]
+        stages.refuse_options(given_in_vain, f"of '{resolved.name}'")
         if isinstance(resolved, RobotStreamRecipe):
             advice.of_questions(resolved.backbone, resolved.probe.only_set)
             if run is not None:
                 resuming.check_seen(run, [resolved.probe.only_set], "train")
-        dry_run_of = stages.DRY_RUN_STREAM if isinstance(resolved, RobotStreamRecipe) else None
-        no_dry_run = dry_run and dry_run_of is None
-        unused = {"--demos": demos, "--anchor": anchor, "--dry-run": no_dry_run}
-        stages.refuse_options(
-            [name for name, value in unused.items() if value], f"of '{resolved.name}'"
-        )
-        if dry_run and dry_run_of is not None:
-            report = dry_run_of.run(
-                resolved, out, resume=resume, overwrite=overwrite, device=device, as_json=as_json
-            )
-            _gate(dry_run_of.module.shortage(report))
-            return
-        more = out, None, None, as_they_are
-        ctx.meta[GOES_ON] = partial(resuming.command, resolved, *more)
-        if isinstance(resolved, RobotStreamRecipe):
-            ctx.meta[LIGHTER] = partial(resuming.lighter, resolved, *more)
-        stages.TRAIN[type(resolved)].run(
-            resolved, out, resume=resume, overwrite=overwrite, device=device, as_json=as_json
-        )
+        options = {"resume": resume, "overwrite": overwrite, "device": device, "as_json": as_json}
+        _train_stream(ctx, resolved, out, as_they_are, dry_run, options)
         return
     paths, resolved = _learned_from(resolved, recipe, demos or [])
     advice.of_training(resolved, anchor)
@@ -479,6 +467,32 @@ def train(
         failed = stage.module.shortage(report) if dry_run else None
         _say_gate(failed)
     _end_at_gate(failed)
+
+
+def _train_stream(
+    ctx: typer.Context,
+    recipe: StreamRecipe | RobotStreamRecipe,
+    out: Path,
+    as_they_are: Sequence[str],
+    dry_run: bool,
+    options: Mapping[str, Any],
+) -> None:
+    """Train on a stream, or only measure what that needs.
+
+    Args:
+        as_they_are: options that a command to resume the run repeats.
+        options: those of the stage.
+    """
+    if dry_run:
+        stage = stages.DRY_RUN_STREAM
+        report = stage.run(recipe, out, **options)
+        _gate(stage.module.shortage(report))
+        return
+    more = out, None, None, as_they_are
+    ctx.meta[GOES_ON] = partial(resuming.command, recipe, *more)
+    if isinstance(recipe, RobotStreamRecipe):
+        ctx.meta[LIGHTER] = partial(resuming.lighter, recipe, *more)
+    stages.TRAIN[type(recipe)].run(recipe, out, **options)
 
 
 def _kept_options(ctx: typer.Context, device: str | None, as_json: bool) -> list[str]:

@@ -38,7 +38,8 @@ def refused_unmoved(run: assemble.TrainingRun, message: str) -> None:
     assert all(torch.equal(p, before[name]) for name, p in run.policy.named_parameters())
 
 
-def test_an_anchor_gradient_of_zero_is_no_step(run: assemble.TrainingRun) -> None:
+def without_anchor_gradient(run: assemble.TrainingRun) -> None:
+    """Let the run's penalty be constant."""
     penalty = run.parts.penalty
     assert penalty is not None
 
@@ -47,20 +48,17 @@ def test_an_anchor_gradient_of_zero_is_no_step(run: assemble.TrainingRun) -> Non
         return whole * 0, w2
 
     run.parts = replace(run.parts, penalty=zero)
+
+
+def test_an_anchor_gradient_of_zero_is_no_step(run: assemble.TrainingRun) -> None:
+    without_anchor_gradient(run)
     refused_unmoved(run, "anchor gradient of zero in all")
     assert len(run.ledger) == 0
 
 
 def test_another_methods_penalty_may_be_at_its_minimum(run: assemble.TrainingRun) -> None:
     """Such as the distance to the weights that the training began with, in its first step."""
-    penalty = run.parts.penalty
-    assert penalty is not None
-
-    def zero(seen: Pass) -> tuple[Tensor, Tensor]:
-        whole, w2 = penalty(seen)
-        return whole * 0, w2
-
-    run.parts = replace(run.parts, penalty=zero)
+    without_anchor_gradient(run)
     run.method = replace(run.method, needs=frozenset())
     step(run)
     assert len(run.ledger) == 1
